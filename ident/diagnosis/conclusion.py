@@ -53,8 +53,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
         # Without the reference's prior, gains of the sensors and drive inertias compensate each other.
         named = zip(state.selection.nuisance, nuisance, strict=True)
         tolerated = [rows for name, rows in named if not name.startswith(GAIN)]
-        evidence.replace([*(one.claim.trial.rows for one in kept), *tolerated])
-        worn = wear(bench, task.reference, shown)
+        claimed = [one.claim.trial.rows for one in kept]
+        worn = wear(bench, task.reference, shown, claimed, tolerated, remainders)
     members = [
         Member((one.claim.trial.rows,), one.claim.gain, finding=finding)
         for one, finding in zip(kept, findings, strict=True)

@@ -20,8 +20,9 @@ from fri.errors import ConfigurationError
 from lwr_driver.yaml_text import yaml_content
 
 WEIGHTS = "confidence.yaml"
-# Least probability of a finding.
-_HARDLY = 0.1
+
+HARDLY = 0.5
+"""Least probability of a finding: more likely right than wrong."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +115,10 @@ def scaled(grounds: Mapping[str, float]) -> np.ndarray[Any, np.dtype[np.float64]
 
 
 def believable(grounds: Mapping[str, float]) -> bool:
-    """Whether a finding with these grounds is worth telling, as a name to test."""
-    return not grounds or probability(Grounds(**grounds)) >= _HARDLY
+    """Whether a finding with these grounds is worth telling: one of the causes that it lists is more likely right than
+    none."""
+    listed = {**grounds, "rivals": LIMITS["rivals"][1]}
+    return not grounds or probability(Grounds(**listed)) >= HARDLY
 
 
 def probability(grounds: Grounds) -> float:

@@ -138,13 +138,11 @@ def _refuted(
 
     fallen : interval of the fall of their chi-square by it; above zero it confirms the claim. hardly : the held-out
     sessions hardly excite the cause, so they need only not contradict it. A cause with ample evidence in the rows
-    fitted, or almost confirmed by the others, may be this one or another. A weak claim has to be confirmed.
+    fitted, or almost confirmed by the others, may be this one or another.
     """
     low, high = fallen
     if _untested(claim, finding) or low > 0.0:
         return False
-    if claim.weak:
-        return True
     least = claim.trial.candidate.effect.evidence_factor * bench.evidence.settings.least_gain
     shown = low + high > 0.0 and claim.gain > _TO_SPARE * least
     silent = hardly and high > -_ALL_BUT * claim.gain
@@ -162,7 +160,7 @@ def _plain(
         return _power(claim, bench) > FELT_POWER
     if _untested(claim, finding):
         return True
-    return not claim.weak and _seen(fallen[0], grounds)
+    return _seen(fallen[0], grounds)
 
 
 def _seen(low: float, grounds: Grounds) -> bool:
@@ -185,9 +183,11 @@ def _grounds(
     least = effect.evidence_factor * bench.evidence.settings.least_gain
     sure = min(max(claim.confidence, 1e-6), 1.0 - 1e-6)
     before = max(shown.test_rms_before, 1e-12)
+    # What the samples themselves show needs no significance by blocks.
+    p_value = 0.0 if effect.seen_in_samples(claim.trial.shape) else shown.p_value
     return Grounds(
         gain=math.log(max(claim.gain / least, 1e-3)),
-        significance=-math.log10(max(shown.p_value, 1e-300)),
+        significance=-math.log10(max(p_value, 1e-300)),
         rivals=math.log(sure / (1.0 - sure)),
         held_out=0.0 if untested else (low + high) / max(high - low, 1e-12),
         untested=float(untested),

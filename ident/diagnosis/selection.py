@@ -60,8 +60,7 @@ Null = Mapping[tuple[str, int], float]
 class Claim:
     """An accepted trial: its score beside all other claims, and the candidates of similar gain.
 
-    outdone : a rival without enough evidence of its own has a larger gain in the same rows. weak : not enough
-    evidence for a claim by itself; a finding only if held-out sessions confirm it.
+    outdone : a rival without enough evidence of its own has a larger gain in the same rows.
     """
 
     trial: Trial
@@ -69,7 +68,6 @@ class Claim:
     alternatives: tuple[tuple[Candidate, float], ...] = ()
     confidence: float = 1.0
     outdone: bool = False
-    weak: bool = False
 
     @property
     def gain(self) -> float:
@@ -90,10 +88,7 @@ class Selection:
 def select(
     dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings, null: Null | None = None
 ) -> Selection:
-    """Accept causes one after the other as long as the evidence suffices.
-
-    Without any, accept the best weak one, if there are held-out sessions for its test and gains of a healthy arm.
-    """
+    """Accept causes one after the other as long as the evidence suffices."""
     state = _State(dictionary, evidence, settings, null or {})
     state.tolerate([])
     first: dict[tuple[str, int], float] = {}
@@ -105,11 +100,9 @@ def select(
         if best is None:
             break
         log.info("%s: gain %.0f", best.candidate.key, best.score.gain)
-        accepted = state.reconsider([*accepted, best])
+        accepted = state.merged(state.reconsider([*accepted, best]))
         if best.candidate.key not in [t.candidate.key for t in accepted]:
             break
-    if not accepted and null and dictionary.nominal.held_out:
-        accepted = state.weak_claims()
     claims = [state.claim(accepted, k) for k in range(len(accepted))]
     while doubtful := [
         k for k, c in enumerate(claims) if c.outdone or state.leftover(c.trial, _others(claims, k))
@@ -166,12 +159,6 @@ def _same_moment(trial: Trial, other: Trial) -> bool:
     return one["session"] == two["session"] and apart < _PAUSE_S
 
 
-def _lasting(trial: Trial) -> bool:
-    """Whether a trial predicts other motions, unlike a brief event or a change between sessions."""
-    effect = trial.candidate.effect
-    return not effect.event and effect.side != "timing" and effect.mode(trial.shape) != "between"
-
-
 def _is_its_mean(trial: Trial, other: Trial) -> bool:
     """Whether a trial may be the mean of the model-form error of another in the same joint."""
     one, two = trial.candidate, other.candidate
@@ -209,7 +196,6 @@ class _State:
     null: Null
     nuisance: dict[str, tuple[float, float]] = field(default_factory=dict)
     nuisance_rows: list[Rows] = field(default_factory=list)
-    weak: bool = False
     _tolerances: list[_Tolerance] | None = None
 
     # ---- tolerated deviations ----
@@ -333,13 +319,6 @@ class _State:
             carried = [t for t in carried if t.candidate.key != best.candidate.key]
         return None
 
-    def weak_claims(self) -> list[Trial]:
-        """The foremost trial with less evidence, testable on other motions; empty if there is none."""
-        self.weak = True
-        found = [t for t in self.contenders([]) if _lasting(t) and self.carried(t)]
-        best = self.next([], found)
-        return [] if best is None else [best]
-
     def refined(self, trial: Trial) -> Trial:
         """The trial with its shape at the best fit, unless cross-validation contradicts that shape."""
         found = self.dictionary.refine(trial, self.choices(trial))
@@ -368,7 +347,7 @@ class _State:
         """Whether the evidence for the trial suffices: gain, significance, and size."""
         score = trial.score if score is None else score
         settings = self.settings
-        strict = trial.candidate.effect.evidence_factor * (settings.weak if self.weak else 1.0)
+        strict = trial.candidate.effect.evidence_factor
         least = strict * (settings.least_gain + 6.0 * (len(score.coefficients) - 1))
         least = max(least, self.null.get(trial.candidate.key, 0.0))
         if trial.candidate.effect.seen_in_samples(trial.shape):
@@ -380,8 +359,7 @@ class _State:
         needed = strict * settings.least_inflation
         # A cause in few blocks cannot be significant by blocks, however large; cross-validation decides instead.
         rare = score.gain > _PLAIN * least and _PLAIN * needed < size < np.inf
-        eased = rare or self.weak
-        return size > needed and score.p_value < (settings.alpha_rare if eased else settings.alpha)
+        return size > needed and score.p_value < (settings.alpha_rare if rare else settings.alpha)
 
     def concentration(self, trial: Trial, score: Score) -> float:
         """Number of a trial's groups of rows over their effective number `(sum p)^2 / sum p^2`.
@@ -443,6 +421,23 @@ class _State:
                 k += 1
             if not changed:
                 break
+        return accepted
+
+    def merged(self, accepted: list[Trial]) -> list[Trial]:
+        """Without special cases that a cause containing them, fitted in their stead, leaves nothing to explain of."""
+        for general in accepted:
+            cases = [(cause, general.candidate.joint) for cause in general.candidate.effect.contains]
+            for special in (t for t in accepted if t.candidate.key in cases):
+                rest = [t for t in accepted if t is not general and t is not special]
+                self.tolerate(rest)
+                alone = self.dictionary.best(general.candidate)
+                if alone is None:
+                    continue
+                alone = self.dictionary.refine(alone, self.choices(alone))
+                self.tolerate([*rest, alone])
+                left = self.dictionary.best(special.candidate)
+                if left is None or not self.carried(left):
+                    return [*rest, alone]
         return accepted
 
     def competing(self, here: Trial, rivals: Sequence[Trial], rest: Sequence[Trial]) -> list[Trial]:
@@ -519,7 +514,7 @@ class _State:
         # Of many times tried, one always fits to some degree.
         lasting = (t for t in close if not t.candidate.effect.event)
         outdone = any(_gain(t) > _gain(again) and not self.carried(t) for t in lasting)
-        return Claim(again, again.score, alike, sure, outdone, self.weak)
+        return Claim(again, again.score, alike, sure, outdone)
 
     def same_torque(self, candidate: Candidate) -> Candidate | None:
         """The candidate of the same torque in these sessions, by the physics of the effect."""

@@ -28,7 +28,6 @@ class DiagnosisSettings:
     alpha : significance of a claim, each candidate by itself, from blocks. alpha_rare : for obvious causes in few
         blocks, with a significance limited by the number of blocks.
     least_gain : least fall of the cross-validated chi-square by a claim.
-    weak : factor on `least_gain` and `least_inflation` for a single weak claim confirmed by held-out sessions.
     least_inflation : least relative excess of the residual's power in the affected rows.
     rounds : largest number of effects.
     most_s : largest length of motion in use; evenly spread windows of longer sessions.
@@ -49,7 +48,6 @@ class DiagnosisSettings:
     alpha: float = 1e-5
     alpha_rare: float = 1e-3
     least_gain: float = 30.0
-    weak: float = 0.4
     least_inflation: float = 0.005
     rounds: int = 8
     most_s: float = 240.0

@@ -3,17 +3,23 @@
 A change of friction or drive inertia leaves no residual, for the base parameters absorb it. Against a reference it
 shows in the parameters themselves: estimated by these sessions alone, beside all claims, their difference from the
 healthy ones is compared with both uncertainties and with the arm's changes from day to day (`reference.habit`), joint
-by joint (Hotelling's T^2). Friction at another level in all sessions may be worn or warmer; the same motion cold and
-warm decides.
+by joint (Hotelling's T^2). What a claim on the same torque moves in these parameters is no evidence, for its law and
+theirs share the friction between them; nor is a change beside a larger remainder without a name: what leaves the
+remainder bends the parameters, too. Friction at another level in all sessions may be worn or warmer; the
+same motion cold and warm decides.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
-from ident.diagnosis.evidence import Floats
+from ident.diagnosis.confidence import HARDLY
+from ident.diagnosis.evidence import Floats, Rows
 from ident.diagnosis.held_out import HeldOut
+from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
 from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.selection import Claim
@@ -41,8 +47,15 @@ def is_level(claim: Claim) -> bool:
     return same and claim.trial.shape.form is Course.SINCE_REFERENCE
 
 
-def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Finding]:
-    """Findings of changed drives, beside the present columns of the evidence. after : held-out rows with them."""
+def wear(
+    bench: DiagnosisBench,
+    reference: Reference,
+    after: HeldOut,
+    claimed: Sequence[Rows],
+    tolerated: Sequence[Rows],
+    remainders: Sequence[Remainder],
+) -> list[Finding]:
+    """Findings of changed drives beside claimed and tolerated columns. after : held-out rows with the claims."""
     nominal, evidence = bench.nominal, bench.evidence
     prior = reference.prior(nominal.base, nominal.masses, wider=1.0)
     if prior is None or not reference.sets or "motor" not in nominal.rows:
@@ -51,6 +64,7 @@ def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Fi
     known = np.flatnonzero(np.diag(precision) > 0.0)
     spread = np.zeros_like(precision)
     spread[np.ix_(known, known)] = np.linalg.inv(precision[np.ix_(known, known)])
+    evidence.replace([*claimed, *tolerated])
     values, covariance = evidence.free()
     # Motor torques sampled at another phase of the commands show another inertia.
     other = ("Ia",) if nominal.arm.motor_delay_s != reference.motor_delay_s else ()
@@ -65,6 +79,11 @@ def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Fi
             continue
         change = values[places] - healthy[places]
         own = covariance[np.ix_(places, places)] + spread[np.ix_(places, places)]
+        others = [rows for rows in claimed if ("motor", joint) not in rows]
+        if len(others) < len(claimed):
+            evidence.replace([*others, *tolerated])
+            moved = values[places] - evidence.free()[0][places]
+            own = own + np.outer(moved, moved)
         if nominal.slow_motor_samples:
             # The phase of slow samples differs from day to day, evenly.
             drive = np.array([nominal.base.names[k].startswith("Ia") for k in places])
@@ -78,7 +97,12 @@ def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Fi
         labels = [names[nominal.base.names[k]] for k in places]
         sizes = dict(zip(labels, np.abs(share / std).tolist(), strict=True))
         heavier = sizes.get("inertia", 0.0) > max(_CLEAR, 0.5 * max(sizes.values()))
-        sure = 1.0 / (1.0 + _RARE * p_value)
+        torque = nominal.rows["motor"].matrix[joint][:, places] @ change
+        columns = [*claimed, *tolerated, {("motor", joint): torque[:, None]}]
+        rest = _left(bench, reference, columns, remainders, joint)
+        sure = max(1.0 - rest / square, 0.0) / (1.0 + _RARE * p_value)
+        if sure < HARDLY:
+            continue
         before, rms = _errors(bench, after, joint, np.array(places), change)
         found.append(
             Finding(
@@ -97,6 +121,25 @@ def wear(bench: DiagnosisBench, reference: Reference, after: HeldOut) -> list[Fi
             )
         )
     return found
+
+
+def _left(
+    bench: DiagnosisBench,
+    reference: Reference,
+    columns: Sequence[Rows],
+    remainders: Sequence[Remainder],
+    joint: int,
+) -> float:
+    """Gain of the remainders in a joint's motor torque beside columns with its wear."""
+
+    def mine(found: Sequence[Remainder]) -> float:
+        return sum(r.gain for r in found if (r.side, r.joint - 1) == ("motor", joint))
+
+    if not mine(remainders):
+        return 0.0
+    evidence = bench.evidence
+    evidence.replace(columns)
+    return mine(find_remainders(bench.dictionary, evidence, evidence.settings, reference.limits()))
 
 
 def _errors(

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.confidence import fit, reliability
 from ident.diagnosis.candidates import _scan
-from ident.diagnosis.confidence import LIMITS, SIGNS, Grounds, probability, scaled
+from ident.diagnosis.confidence import LIMITS, SIGNS, Grounds, believable, probability, scaled
 
 USUAL = Grounds(
     gain=2.0,
@@ -42,6 +42,17 @@ def test_grounds_beyond_their_range_count_as_its_end() -> None:
     assert scaled(replace(USUAL, gain=1e9).to_dict())[0] == 1.0
     assert scaled(replace(USUAL, gain=-5.0).to_dict())[0] == 0.0
     assert tuple(USUAL.to_dict()) == tuple(LIMITS) == tuple(SIGNS)
+
+
+def test_a_finding_is_told_if_one_of_its_causes_is_more_likely_right_than_none() -> None:
+    assert believable({})
+    plain = replace(USUAL, rest=0.0, replaceable=0.0)
+    assert believable(plain.to_dict())
+    assert not believable(replace(plain, gain=0.0, significance=3.0, felt=0.0).to_dict())
+    # Even odds between two names are no doubt about both.
+    between = replace(plain, rivals=-1.0, company=2.0)
+    assert probability(between) < 0.5 < probability(replace(between, rivals=6.0))
+    assert believable(between.to_dict())
 
 
 def test_the_fit_finds_the_odds_behind_findings() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from ident.diagnosis import Diagnosis, Reference, commission, diagnose
 from ident.diagnosis.reference import INERTIA_BY_PHASE, habit
@@ -65,6 +66,30 @@ def test_a_healthy_day_and_an_arm_without_reference_show_no_wear(
 ) -> None:
     assert not worn(diagnose(pair(make, seed=31), chain, reference=reference))
     assert not worn(diagnose(pair(make, friction(1.0)), chain))
+
+
+def test_a_law_that_shares_the_friction_with_the_healthy_one_is_no_wear_beside_itself(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def swell(s: Signals) -> None:
+        v = s["qd"][:, 1]
+        s["motor"][:, 1] += 1.5 * np.sign(v) * np.abs(v) ** 0.4 - 0.8 * v
+
+    found = diagnose(pair(make, swell), chain, reference=reference)
+    assert [f.joints for f in found.findings] == [(2,)]
+    assert not worn(found)
+
+
+def test_a_torque_of_no_name_bends_the_parameters_and_is_no_wear(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def lagging(s: Signals) -> None:
+        step = float(np.median(np.diff(s["time"])))
+        s["motor"][:, 1] += 3.0 * lfilter([step / 0.1], [1.0, step / 0.1 - 1.0], s["qd"][:, 1])
+
+    found = diagnose(pair(make, lagging), chain, reference=reference)
+    assert not worn(found)
+    assert any((u.side, u.joint) == ("motor", 2) for u in (*found.nameless, *found.unexplained))
 
 
 def test_wear_is_no_part_of_the_extension(make: Make, chain: Chain, reference: Reference) -> None:
