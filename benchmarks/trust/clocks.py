@@ -12,19 +12,16 @@ import re
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.trust.stand import Stand, shared_ring, the_motion
-from benchmarks.trust.table import Ledger
+from benchmarks.trust.table import Ledger, stamp
 from fri.states import Quality
 from lwr_driver.control import Job, Mode, Result, Text, Word
 from lwr_driver.ring import Ring
-from runner.computer import git_commit
 
 __all__ = ["campaign"]
 
@@ -136,15 +133,9 @@ def _judge(case: _Case, stand: Stand, lead: float, rows: int) -> list[str]:
     return bad
 
 
-@cache
-def _stamp() -> dict[str, str]:
-    """Commit and date at the beginning."""
-    return {"commit": git_commit()[:7], "date": datetime.now(UTC).date().isoformat()}
-
-
 def campaign(ledger: Ledger, options: Any) -> None:
     """A line for each kind of disagreement."""
-    _stamp()
+    stamp()
     each = max(1, (options.runs or _RUNS) // len(_CASES))
     with shared_ring() as ring, tempfile.TemporaryDirectory() as name:
         for what, case in _CASES.items():
@@ -156,5 +147,5 @@ def campaign(ledger: Ledger, options: Any) -> None:
                 bad, lead = _run(case, random, ring, Path(name))
                 line.count(bad, f"run {number}")
                 leads.append(lead)
-            line.figures = {"largest lead over time [rows]": round(max(leads), 2), **_stamp()}
+            line.figures = {"largest lead over time [rows]": round(max(leads), 2), **stamp()}
             ledger.finish("clocks", what)

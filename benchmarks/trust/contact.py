@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.trust.stand import Clock, TimedTurnaround, shared_ring
-from benchmarks.trust.table import Ledger, Line
+from benchmarks.trust.table import Ledger, Line, stamp
 from fri.controller_end import ControllerEnd
 from fri.in_process import Network
 from fri.states import State
@@ -25,7 +24,6 @@ from lwr_driver.control import Control, Job, Mode, Text
 from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.motion import Motion
 from lwr_driver.ring import Ring
-from runner.computer import git_commit
 from runner.experiment_file import Experiment, Payload
 from runner.planning import Excitations
 from runner.preflight import load_data
@@ -289,13 +287,6 @@ def healthy(period_ms: int, seed: int, ring: Ring, *, loaded: bool = True) -> Ru
     return run
 
 
-@cache
-def _stamp() -> dict[str, str]:
-    """Commit and date at the beginning."""
-    commit = git_commit()
-    return {"commit": commit[:7] + commit[40:], "date": datetime.now(UTC).date().isoformat()}
-
-
 def _most(found: list[Run], name: str) -> Any:
     values = [getattr(run, name) for run in found if getattr(run, name) is not None]
     return max(values, default=None)
@@ -309,7 +300,7 @@ def _figures(line: Line, found: dict[int, list[Run]]) -> None:
     every = [run for runs in found.values() for run in runs]
     line.figures["largest torque of the contact [Nm]"] = round(_most(every, "peak"), 1)
     line.figures["largest joint torque over its limit"] = round(_most(every, "share"), 2)
-    line.figures |= _stamp()
+    line.figures |= stamp()
 
 
 def _pieces(options: Any) -> Iterator[tuple[str, list[tuple[Any, ...]]]]:
@@ -331,7 +322,7 @@ def _pieces(options: Any) -> Iterator[tuple[str, list[tuple[Any, ...]]]]:
 
 def campaign(ledger: Ledger, options: Any) -> None:
     """Lines of the pushes by joint, of an obstacle, and of healthy runs."""
-    _stamp()
+    stamp()
     with shared_ring() as ring:
         for what, plan in _pieces(options):
             if not plan or ledger.has("contact", what):
@@ -364,7 +355,7 @@ def campaign(ledger: Ledger, options: Any) -> None:
                 for name, value in (("external", run.peak), ("joint", run.share)):
                     figure = f"{name} torque over its limit, at most"
                     line.figures[figure] = max(round(value, 2), line.figures.get(figure, 0.0))
-                line.figures |= _stamp()
+                line.figures |= stamp()
                 ledger.finish("contact", piece)
             ledger.finish("contact", what)
             options.say(str(ledger.line("contact", what)))

@@ -17,8 +17,6 @@ import signal
 import tempfile
 import threading
 import time
-from datetime import UTC, datetime
-from functools import cache
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -28,14 +26,13 @@ from numpy.typing import NDArray
 
 from benchmarks.reply_latency import START, send
 from benchmarks.trust.lab import descendants, gone
-from benchmarks.trust.table import Ledger
+from benchmarks.trust.table import Ledger, stamp
 from fri.errors import LwrError
 from lwr_driver.arm import Arm
 from lwr_driver.driver import Driver, LinkSettings
 from lwr_driver.motion import move_to
 from lwr_driver.realtime import assess
 from lwr_driver.session import session_metadata
-from runner.computer import git_commit
 from runner.laboratory import free_port
 
 __all__ = ["campaign"]
@@ -154,7 +151,7 @@ def _measure(period_ms: int, runs: int, what: str, line: Any, say: Any) -> None:
         "p99.9 [us]": round(1e6 * float(np.quantile(on_time, 0.999, method="inverted_cdf")), 1),
         "motions": first.motions,
         "processor": processor,
-        **_stamp(),
+        **stamp(),
     }
 
 
@@ -181,15 +178,9 @@ def _send(ports: list[int], period_ms: int, results: Connection) -> None:
     send(ports, period_ms, results)
 
 
-@cache
-def _stamp() -> dict[str, str]:
-    """Commit and date at the beginning."""
-    return {"commit": git_commit()[:7], "date": datetime.now(UTC).date().isoformat()}
-
-
 def campaign(ledger: Ledger, options: Any) -> None:
     """A line for each period, and one for a second driver that is killed."""
-    _stamp()
+    stamp()
     for shortage in (*assess().missing, *assess().advice):
         options.say(f"  {shortage}")
     runs = options.runs or _RUNS

@@ -15,14 +15,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from benchmarks.trust.table import Ledger
-from runner.computer import git_commit
+from benchmarks.trust.table import Ledger, stamp
 
 __all__ = ["CASES", "campaign", "judge"]
 
@@ -296,7 +294,7 @@ def campaign(ledger: Ledger, options: Any) -> None:
             continue
         bad, took = judge(kind, key, value)
         line = ledger.line("files", kind if key else "unchanged")
-        line.figures |= {"commit": git_commit()[:9], "date": f"{datetime.now(UTC):%Y-%m-%d}"}
+        line.figures |= stamp()
         line.count(bad, f"case {number}, {key} = {value!r:.60}")
         if bad:
             options.say(f"case {number}, {kind}, {key} = {value!r:.60}: {bad}")

@@ -19,7 +19,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +26,8 @@ import numpy as np
 import yaml
 
 from benchmarks.trust.lab import descendants, gone
-from benchmarks.trust.table import Ledger
+from benchmarks.trust.table import Ledger, stamp
 from lwr_driver.session import read_session
-from runner.computer import git_commit
 
 __all__ = ["REFUSED", "campaign"]
 
@@ -269,7 +267,7 @@ def _two_at_once(template: Path, folder: Path) -> list[str]:
 
 def _counted(ledger: Ledger, line: str, bad: list[str], name: str) -> None:
     entry = ledger.line("resume", line)
-    entry.figures |= {"commit": git_commit()[:9], "date": f"{datetime.now(UTC):%Y-%m-%d}"}
+    entry.figures |= stamp()
     entry.count(bad, name)
 
 

@@ -6,10 +6,21 @@ import json
 import os
 import platform
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Ledger", "Line"]
+from runner.computer import git_commit
+
+__all__ = ["Ledger", "Line", "stamp"]
+
+
+@cache
+def stamp() -> dict[str, str]:
+    """Commit, with + for changes not committed, and date at the first call."""
+    commit = git_commit()
+    return {"commit": commit[:7] + commit[40:], "date": datetime.now(UTC).date().isoformat()}
 
 
 @dataclass

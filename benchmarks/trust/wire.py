@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.trust.stand import LABEL, Stand, shared_ring, the_motion
-from benchmarks.trust.table import Ledger
+from benchmarks.trust.table import Ledger, stamp
 from benchmarks.trust.wire_faults import FAULTS, NAMED, PERIODS_MS, SEEN, Fault
 from fri.states import State
 from lwr_driver.control import Job, Mode, Result, Text, Word
@@ -300,6 +300,7 @@ def campaign(ledger: Ledger, options: Any) -> None:
             for number in range(first, min(first + _BLOCK, total)):
                 _enter(ledger, run(options.seed, number, ring, Path(folder)))
             ledger.finish("wire", piece)
+            ledger.line("wire", "all").figures |= stamp()
             failed = ledger.line("wire", "all").failed
             options.say(f"wire: {first + _BLOCK} of {total} runs, {failed} failed")
 
