@@ -30,9 +30,10 @@ import click
 from joblib import Parallel, delayed
 
 import ident.diagnosis
+from benchmarks.discovery.campaign import store_of
 from benchmarks.discovery.tally import read_results
 from ident.diagnosis.settings import DiagnosisSettings
-from tests.hidden_physics.cases import Store, draw
+from tests.hidden_physics.cases import draw
 from tests.hidden_physics.engine import commissioned, diagnosed
 from tests.hidden_physics.verdict import SURE
 
@@ -94,7 +95,7 @@ def _tried(
     with _changed(number, changed):
         flips = []
         for result in cases:
-            store = Store(out / "sessions")
+            store = store_of(out, result.get("era", 0))
             _, kind, cause, encoder = result["id"].split()
             case = draw(
                 result["truth"]["seed"],

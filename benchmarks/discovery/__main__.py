@@ -29,6 +29,9 @@ from benchmarks.discovery.tally import read_results, summary, tables
 @click.option("--skip", default=0, show_default=True, help="Leave out so many of the first cases.")
 @click.option("--jobs", default=1, show_default=True, help="Processes at a time.")
 @click.option("--days", default=12, show_default=True, help="Healthy days that the reference rests on.")
+@click.option(
+    "--eras", default=1, show_default=True, help="References, each of other days, for cases in turn."
+)
 @click.option("--without-reference", is_flag=True, help="Diagnose as if the arm had never been commissioned.")
 @click.option("--cause", "causes", multiple=True, help="Hide only these, one at a time.")
 @click.option("--kind", "kinds", multiple=True, type=click.Choice(KINDS), help="Draw only such cases.")
@@ -49,6 +52,7 @@ def main(
     skip: int,
     jobs: int,
     days: int,
+    eras: int,
     without_reference: bool,
     causes: tuple[str, ...],
     kinds: tuple[str, ...],
@@ -60,7 +64,7 @@ def main(
     out: Path,
 ) -> None:
     """Hide physics in simulated sessions, have them diagnosed, and count what is found."""
-    plan = Plan(out, cases, seed, days, not without_reference, causes, kinds, discard, members, skip)
+    plan = Plan(out, cases, seed, days, not without_reference, causes, kinds, discard, members, skip, eras)
     if not report:
         if recommission:
             plan.forget_references()

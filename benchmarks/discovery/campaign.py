@@ -38,7 +38,8 @@ _MOTOR_SIDE = 4
 class Plan:
     """What to run, see the command's help.
 
-    out : folder of everything. kinds : of cases, in turn; by default as `_KINDS` mixes them
+    out : folder of everything. eras : numbers of references, each of other days, with days of its own for the cases,
+    which take them in turn. kinds : of cases, in turn; by default as `_KINDS` mixes them
     """
 
     out: Path
@@ -51,21 +52,21 @@ class Plan:
     discard: bool = False
     members: bool = True
     skip: int = 0
+    eras: int = 1
 
     @property
     def results(self) -> Path:
         """One line of JSON a case."""
         return self.out / ("results.jsonl" if self.reference else "results_without_reference.jsonl")
 
-    @property
-    def store(self) -> Store:
-        """Where the sessions are."""
-        return Store(self.out / "sessions")
+    def store(self, seed: int) -> Store:
+        """Where the sessions of a case are."""
+        return store_of(self.out, seed % self.eras)
 
     def forget_references(self) -> None:
         """Delete the references, and what healthy twins showed by them."""
         for pattern in ("reference_*.yaml", "*/clean_error_*.json"):
-            for path in self.store.folder.glob(pattern):
+            for path in self.out.glob(f"sessions*/{pattern}"):
                 path.unlink()
 
     def wanted(self) -> Iterator[tuple[int, str, str | None, Encoder]]:
@@ -92,6 +93,11 @@ class Plan:
                 yield seed, kind, cause, encoder
 
 
+def store_of(out: Path, era: int) -> Store:
+    """The sessions of an era in the folder of a campaign."""
+    return Store(out / ("sessions" if era == 0 else f"sessions_{era}"), era)
+
+
 def run(plan: Plan, jobs: int, again: bool, say: Callable[[str], Any]) -> None:
     """Run what has no result yet (`again`: everything), printing a line a case."""
     plan.out.mkdir(parents=True, exist_ok=True)
@@ -102,10 +108,10 @@ def run(plan: Plan, jobs: int, again: bool, say: Callable[[str], Any]) -> None:
         done = {json.loads(line)["id"] for line in plan.results.read_text().splitlines()}
     wanted = [entry for entry in plan.wanted() if _identity(*entry) not in done]
     if plan.reference and wanted:
-        for encoder in sorted({_encoder(entry) for entry in wanted}):
+        for era, encoder in sorted({(entry[0] % plan.eras, _encoder(entry)) for entry in wanted}):
             began = time.monotonic()
-            path = commissioned(plan.store, encoder, plan.days)
-            say(f"reference with the {encoder} encoder: {path.name}, {time.monotonic() - began:.0f} s")
+            path = commissioned(plan.store(era), encoder, plan.days)
+            say(f"reference {path.relative_to(plan.out)}: {time.monotonic() - began:.0f} s")
     work = Parallel(n_jobs=jobs, return_as="generator_unordered")
     count = len(done)
     with plan.results.open("a", encoding="utf-8") as stream:
@@ -129,10 +135,10 @@ def _identity(seed: int, kind: str, cause: str | None, encoder: str) -> str:
 def _one(plan: Plan, seed: int, kind: str, cause: str | None, encoder: Encoder) -> dict[str, Any]:
     """Draw, record, diagnose, judge; a crash of the diagnosis is a result like any other."""
     logging.getLogger("ident").setLevel(logging.ERROR)
-    store = plan.store
+    store = plan.store(seed)
     case = draw(seed, kind, store, causes=None if cause is None else [cause], encoder=encoder)
     identity = _identity(seed, kind, cause, encoder)
-    result: dict[str, Any] = {"id": identity, "truth": case.truth()}
+    result: dict[str, Any] = {"id": identity, "era": store.era, "truth": case.truth()}
     healthy = twin(case.schedule, case.day)
     twin_error = store.error(healthy)
     result["rho"] = inflation(store.error(case), twin_error) if case.hidden else 1.0
@@ -144,7 +150,7 @@ def _one(plan: Plan, seed: int, kind: str, cause: str | None, encoder: Encoder) 
     reference = commissioned(store, case.day.encoder, plan.days) if plan.reference else None
     try:
         diagnosis, seconds = diagnosed(sessions, reference)
-        clean = _twin_errors(plan, healthy, reference) if case.hidden else None
+        clean = _twin_errors(store, healthy, reference) if case.hidden else None
     except Exception:
         return {**result, "crash": traceback.format_exc()}
     result["seconds"] = seconds
@@ -157,13 +163,13 @@ def _one(plan: Plan, seed: int, kind: str, cause: str | None, encoder: Encoder) 
     return result
 
 
-def _twin_errors(plan: Plan, healthy: Case, reference: Path | None) -> np.ndarray:
+def _twin_errors(store: Store, healthy: Case, reference: Path | None) -> np.ndarray:
     """Held-out errors of the base model in the diagnosis of the healthy twin, made once."""
-    folder = plan.store.folder / healthy.name
+    folder = store.folder / healthy.name
     kept = folder / f"clean_error_{'with' if reference else 'without'}.json"
     if kept.is_file():
         return np.array(json.loads(kept.read_text()))
-    diagnosis, _ = diagnosed(plan.store.sessions(healthy), reference)
+    diagnosis, _ = diagnosed(store.sessions(healthy), reference)
     errors = error_rows(diagnosis["baseline"]["test_rms"])
     kept.write_text(json.dumps(errors.tolist()))
     return errors

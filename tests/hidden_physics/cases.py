@@ -101,11 +101,13 @@ def _name(*parts: object) -> str:
 class Store:
     """A folder of recorded sessions; what is there is not recorded again.
 
-    folder : anywhere. Healthy twins are shared among the cases of a day.
+    folder : anywhere. Healthy twins are shared among the cases of a day. era : another one has other days, of the
+    cases as of the reference.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, era: int = 0) -> None:
         self.folder = folder
+        self.era = era
 
     def sessions(self, case: Case) -> Sessions:
         """The logs of a case, recorded now where they are missing."""
@@ -192,7 +194,7 @@ def draw(
     needed = {cause.encoder for cause in chosen} - {None}
     if needed:
         (encoder,) = needed  # type: ignore[assignment]
-    day = Day(int(random.integers(_TWIN_DAYS)), encoder)
+    day = Day(_TWIN_DAYS * store.era + int(random.integers(_TWIN_DAYS)), encoder)
     scene = store.scene(schedule, day)
     hidden, taken = [], set[int]()
     for cause in chosen:

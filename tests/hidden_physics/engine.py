@@ -24,7 +24,7 @@ from tests.hidden_physics.robots import Day, Encoder
 __all__ = ["COMMISSIONING_DAYS", "REFERENCE", "commissioned", "diagnosed", "healthy_sets"]
 
 COMMISSIONING_DAYS = 12
-_FIRST_DAY = 5000
+_FIRST_DAY, _ERA_DAYS = 5000, 100
 
 REFERENCE = Path(__file__).parent / "reference.yaml"
 """The healthy arm with the link encoder, commissioned once: `python -m tests.hidden_physics.engine`."""
@@ -36,11 +36,12 @@ def _arm() -> tuple[Chain, ArmData]:
     return Chain.from_urdf(arm.urdf), ArmData(arm.stiffness, arm.gear_ratio)
 
 
-def healthy_sets(encoder: Encoder, days: int, schedules: Sequence[str] = SCHEDULES) -> list[Case]:
+def healthy_sets(
+    encoder: Encoder, days: int, schedules: Sequence[str] = SCHEDULES, era: int = 0
+) -> list[Case]:
     """Healthy days to commission the arm on, each with the motions of one schedule."""
-    return [
-        twin(schedules[number % len(schedules)], Day(_FIRST_DAY + number, encoder)) for number in range(days)
-    ]
+    first = _FIRST_DAY + _ERA_DAYS * era
+    return [twin(schedules[number % len(schedules)], Day(first + number, encoder)) for number in range(days)]
 
 
 def commissioned(
@@ -52,7 +53,7 @@ def commissioned(
         return path
     chain, data = _arm()
     sets = []
-    for case in healthy_sets(encoder, days, schedules):
+    for case in healthy_sets(encoder, days, schedules, store.era):
         sessions = store.sessions(case)
         sets.append([read_session(session) for session in sessions.train])
     reference = commission(sets, chain, arm=data)
