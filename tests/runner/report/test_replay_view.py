@@ -21,7 +21,7 @@ from ident.model.model_file import read_model, write_model
 from runner.cli import main
 from runner.replay_video import frames, write_video
 from runner.replay_view import MotionReplay, error_colour, motion_replay
-from tests.runner.report.view_rig import VISER, flaws, opened
+from tests.runner.report.view_rig import CLIPPED, NARROW, WIDE, flaws, opened
 
 pytestmark = pytest.mark.slow
 
@@ -133,7 +133,7 @@ def test_a_browser_scrubs_through_the_replay(finished: Path, heavier: Path, chro
         address = process.stdout.readline().strip()
         try:
             assert address == "http://127.0.0.1:18231"
-            with opened(chrome, address, (900, 360)) as seen:
+            with opened(chrome, address, (WIDE[0], 360)) as seen:
                 page = seen.page
                 page.get_by_label("play").uncheck(timeout=120_000)
                 time_s = page.locator("input[inputmode=decimal], input[type=number]").first
@@ -157,7 +157,12 @@ def test_a_browser_scrubs_through_the_replay(finished: Path, heavier: Path, chro
                 page.wait_for_timeout(500)
                 extended = torque_errors(page.inner_text("body"))
                 assert page.evaluate(DRAWN) > 100
-                assert {flaw.split(",")[0] for flaw in flaws(seen)} <= VISER
+                for width in (WIDE[0], NARROW[0]):
+                    page.set_viewport_size({"width": width, "height": 360})
+                    page.wait_for_timeout(500)
+                    assert page.get_by_role("slider", name="time [s]").count() == 1
+                    assert flaws(seen) == []
+                    assert page.evaluate(CLIPPED) == []
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 0
         finally:
