@@ -183,6 +183,19 @@ gear_ratio_option = click.option(
 )
 
 
+def arm_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options of a diagnosis on its arm: `arm`, `urdf`, `coupling`, `gear_ratio`."""
+    about = "Arm file (stiffness, gear ratios); default: the one of the sessions' robot."
+    for option in (
+        gear_ratio_option,
+        coupling_option,
+        click.option("--urdf", type=PATH, help="Kinematics; default: the one in the first session."),
+        click.option("--arm", type=NAMED_FILE, help=about),
+    ):
+        command = option(command)
+    return command
+
+
 class GroupedCommand(Verb):
     """A command with its options under headings in the help.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -10,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +16,7 @@ from ident.estimation.compare import Comparison, Difference
 from ident.model import DynamicModel
 from runner.computer import versions
 from runner.report.figure import Figure
+from runner.report.folder import ResultFolder
 from runner.report.markup import Cell, Number, figure_html, paragraph, section, table
 from runner.report.page import page_html
 from runner.report.plot import Line, Mark, Panel, Points
@@ -188,7 +187,7 @@ def _errors(runs: Sequence[Side]) -> list[str]:
     """Torque errors on held-out sessions, of each run with results."""
     rows: list[list[Cell]] = []
     for side in runs:
-        summary: dict[str, Any] = json.loads((side.place / "summary.json").read_text(encoding="utf-8"))
+        summary = ResultFolder.load(side.place).summary
         for one in summary.get("validation") or []:
             error = one.get("torque_error") or {}
             shares = [error.get(side) for side in ("motor", "joint")]

@@ -32,7 +32,9 @@ def test_a_changed_parameter_is_named_on_the_page_and_no_other(
         (tmp_path / name).mkdir()
         write_model(model, tmp_path / name / "model.yaml")
     error = {"session": "check.mcap", "torque_error": {"motor": 0.0512, "joint": None}}
-    (tmp_path / "friday" / "summary.json").write_text(json.dumps({"validation": [error]}))
+    (tmp_path / "friday" / "summary.json").write_text(
+        json.dumps({"exit_status": "ok", "validation": [error]})
+    )
     page = tmp_path / "page.html"
     done = CliRunner().invoke(
         main, ["compare", str(tmp_path / "monday"), str(tmp_path / "friday"), "--report", str(page)]
