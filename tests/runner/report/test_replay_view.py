@@ -103,7 +103,10 @@ def test_the_encoders_are_simulated_where_the_arm_has_them(finished: Path, tmp_p
     healthy = Reference(model, np.full(n, 1e-4), 0.0, 0.0, {}, {}, 3, encoder="motor")
     commissioned = replace(model, provenance={**model.provenance, **healthy.stored()})
     assert encoder_of(real, tmp_path, [commissioned]) == "motor"
-    gap = {"gap": {"value": 1e-3, "std": 1e-4, "unit": "rad"}, "width": {"value": 1.0, "std": 0.1, "unit": "Nm"}}
+    gap = {
+        "gap": {"value": 1e-3, "std": 1e-4, "unit": "rad"},
+        "width": {"value": 1.0, "std": 0.1, "unit": "Nm"},
+    }
     effect = {"cause": "backlash", "joints": [3], "form": "encoder at the motor", "parameters": gap}
     found = replace(model, effects=(effect,))
     assert encoder_of(real, tmp_path, [model, found]) == "motor"
