@@ -49,9 +49,11 @@ class Side:
 
 
 def short_names(first: Path, second: Path) -> tuple[str, str]:
-    """The shortest ends of two paths that differ; the model of a folder of results has the name of its folder."""
-    paths = [Path(os.path.abspath(path)) for path in (first, second)]
-    parts = [(path.parent if path.name == "model.yaml" else path).parts for path in paths]
+    """The shortest ends of two paths that differ; a `model.yaml` goes with its folder, as every run has one."""
+    parts = []
+    for path in (Path(os.path.abspath(first)), Path(os.path.abspath(second))):
+        own = path.parts
+        parts.append((*own[:-2], "/".join(own[-2:])) if path.name == "model.yaml" and len(own) > 2 else own)
     for count in range(1, max(map(len, parts)) + 1):
         ends = [Path(*own[-count:]).as_posix() for own in parts]
         if ends[0] != ends[1]:

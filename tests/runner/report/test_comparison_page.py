@@ -52,13 +52,14 @@ def test_a_changed_parameter_is_named_on_the_page_and_no_other(
 @pytest.mark.parametrize(
     ("first", "second", "names"),
     [
-        ("runs/monday/model.yaml", "runs/friday/model.yaml", ("monday", "friday")),
+        ("runs/monday/model.yaml", "runs/friday/model.yaml", ("monday/model.yaml", "friday/model.yaml")),
+        ("lab/model.yaml", "lab/friday", ("lab/model.yaml", "friday")),
         ("runs/monday", "runs/friday", ("monday", "friday")),
         ("old/arm.yaml", "new/arm.yaml", ("old/arm.yaml", "new/arm.yaml")),
-        ("a/day/run", "b/day/run/model.yaml", ("a/day/run", "b/day/run")),
-        ("run/model.yaml", "run/diagnosis/model_extended.yaml", ("run", "model_extended.yaml")),
+        ("a/day/run", "b/day/run", ("a/day/run", "b/day/run")),
+        ("run/model.yaml", "run/diagnosis/model_extended.yaml", ("run/model.yaml", "model_extended.yaml")),
         ("here/../arm.yaml", "arm.yaml", ("arm.yaml", "arm.yaml again")),
-        ("/model.yaml", "/arm.yaml", ("/", "arm.yaml")),
+        ("/model.yaml", "/arm.yaml", ("model.yaml", "arm.yaml")),
     ],
 )
 def test_the_ends_of_two_paths_tell_them_apart(first: str, second: str, names: tuple[str, str]) -> None:
