@@ -140,6 +140,7 @@ def test_a_line_fits_every_width() -> None:
         ("report . --fromat pdf", "Did you mean '--format'?"),
         ("report . --format pgf", "--format is for figures; add --figures FOLDER"),
         ("check experimnt.yaml", "did you mean experiment.yaml?"),
+        ("trend", "--store fleet: no such file or folder"),
     ],
 )
 def test_a_slip_of_the_pen_is_told_within_a_narrow_screen(line: str, said: str, tmp_path: Path) -> None:
