@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import math
@@ -9,7 +10,7 @@ import os
 import reprlib
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -82,7 +83,17 @@ def find(name: str | Path, *, beside: Path | None = None) -> Path:
                 f"file {_shown(name)!r} cannot be looked for: {error.strerror}"
             ) from error
     tried = ", ".join(_shown(place, 4 * _LONGEST_SHOWN) for place in places)
-    raise ConfigurationError(f"file {_shown(name)!r} not found; tried {tried}")
+    raise ConfigurationError(f"file {_shown(name)!r} not found; tried {tried}; {_near(wanted, places)}")
+
+
+def _near(wanted: Path, places: Iterable[Path]) -> str:
+    """Advice on a name of no file: one that is near, if there is any."""
+    there: list[str] = []
+    for folder in (place.parent for place in places):
+        with contextlib.suppress(OSError):
+            there += (entry.name for entry in folder.iterdir() if entry.is_file())
+    near = difflib.get_close_matches(wanted.name, there, n=1)
+    return f"did you mean {wanted.with_name(near[0])}?" if near else "correct the name"
 
 
 def _shown(name: str | Path, longest: int = _LONGEST_SHOWN) -> str:

@@ -7,6 +7,9 @@ import errno
 import importlib
 import logging
 import os
+import shutil
+import sys
+import textwrap
 import traceback
 from pathlib import Path
 from typing import Any, NoReturn
@@ -22,6 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 log = logging.getLogger(__name__)
 
 _AS_JSON = "runner.as_json"
+_NARROW = 52
 
 VERBS = {
     "init": "a new laboratory: experiment file, arm, cell, KRL program",
@@ -101,11 +105,14 @@ class Verbs(click.Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Read the command line; note whether JSON is wanted, for errors come as JSON then."""
         ctx.meta[_AS_JSON] = "--json" in args
+        columns = shutil.get_terminal_size().columns
+        if columns < _NARROW:  # click writes no less
+            ctx.terminal_width = columns
         try:
             return super().parse_args(ctx, args)
         except click.UsageError as error:
             _answer(ctx, error.format_message(), "UsageError", error.exit_code)
-            raise
+            raise _fitted(error) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the verbs without importing them."""
@@ -125,6 +132,9 @@ class Verbs(click.Group):
             click.echo("aborted", err=True)
             _answer(ctx, "aborted", OperatorError.__name__, OperatorError.exit_code)
             ctx.exit(OperatorError.exit_code)
+        except click.UsageError as error:
+            _answer(ctx, error.format_message(), type(error).__name__, error.exit_code)
+            raise _fitted(error) from error
         except click.ClickException as error:
             _answer(ctx, error.format_message(), type(error).__name__, error.exit_code)
             raise
@@ -146,6 +156,15 @@ class Verbs(click.Group):
             )
         finally:
             status.clear()
+
+
+def _fitted(error: click.UsageError) -> click.UsageError:
+    """The error with its message broken for a terminal, where people look at it."""
+    if not status.watched(sys.stderr):
+        return error
+    width = shutil.get_terminal_size().columns
+    text = textwrap.fill(f"Error: {error.format_message()}", width, subsequent_indent="  ")
+    return click.UsageError(text.removeprefix("Error: "), error.ctx)
 
 
 def _complain(ctx: click.Context, error: LwrError) -> NoReturn:

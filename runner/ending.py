@@ -199,7 +199,7 @@ def of_session(found: SessionSummary) -> Ending:
     sentence = f"{found.duration_s:.1f} s of {data.get('robot', 'an unknown arm')}, {how}."
     numbers = [
         ("payload", found.payload),
-        ("recorded", found.utc_first),
+        ("recorded", found.recorded),
         ("missing", "; ".join(found.missing) or "nothing"),
     ]
     next_step = f"lwr-run recover {path}" if ended is None else f"lwr-run identify {path} --out model.yaml"

@@ -30,7 +30,7 @@ from runner.preflight import Preflight, check_motion_limits, check_path, check_t
 from runner.report.figure import inline_svg
 from runner.report.markup import conditions_table
 from runner.report.plot import STYLES, Line, Panel, Points
-from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, start_server, stop_server
+from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, named_page, start_server, stop_server
 
 Floats = NDArray[np.float64]
 
@@ -202,7 +202,7 @@ def preview_html(planned: Planned) -> str:
             arm.pose(planned.motion.q[row])
             recording.insert_sleep(step)
         # As the value of an attribute in single quotes.
-        scene = recording.as_html().replace("&", "&amp;").replace("'", "&#39;")
+        scene = named_page(recording.as_html()).replace("&", "&amp;").replace("'", "&#39;")
     finally:
         stop_server(server)
     style = resources.files("runner").joinpath("preview.css").read_text(encoding="utf-8")

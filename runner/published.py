@@ -11,15 +11,22 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fri.errors import LwrError
+from ident.dynamics.kinematics import Chain
 from ident.estimation.identify import Identification
 from ident.excitation import Assembled, ExcitationPlan, PlanProblem, assemble, table_row
-from lwr_driver.configuration import find
+from lwr_driver.configuration import CONFIGS, find
 
 SOURCE = (
     "Kolyubin, Shiriaev, Jubien: Refining Dynamics Identification for Co-Bots: Case Study on KUKA LWR4+. "
     "IFAC-PapersOnLine 50-1 (2017)"
 )
+
+
+# Difference of lengths [m] and angles [rad] within one kind of arm.
+_SAME = 0.01
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,19 @@ REBUILT = {
     "Optimised, algorithm 2": "plans/published/algorithm_2.plan.yaml",
 }
 """Motions by the rules of Table 1, whose own coefficients were not published; made by `benchmarks.excitation`."""
+
+
+def is_published_arm(chain: Chain) -> bool:
+    """Whether the arm has the joints of the LWR4+, so that its parameters compare with the published ones.
+
+    Base, flange, zero positions and directions of the joints may differ.
+    """
+    known = Chain.from_urdf((CONFIGS / "lwr4plus.urdf").read_text(encoding="utf-8"))
+    if chain.n != known.n:
+        return False
+    pairs = [(getattr(chain, name), getattr(known, name)) for name in ("alpha", "d", "r")]
+    inner = slice(1, -1)
+    return all(np.allclose(np.abs(a[inner]), np.abs(b[inner]), atol=_SAME) for a, b in pairs)
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,10 @@ from ident.model.model_file import read_model
 from ident.rows.sessions import payload_name
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session
+from runner.encoder import encoder_of
 from runner.estimation import known_arm
 from runner.experiment_file import Payload
-from runner.replay import Replay, Replayed, attached_experiment
+from runner.replay import Encoder, Replay, Replayed, attached_experiment
 from runner.report.folder import ResultFolder
 from runner.report.plot import STYLES
 
@@ -37,6 +38,7 @@ _TEXT_EVERY = 4
 # The largest enlarged deviation of the ghost [rad].
 _SEEN_RAD = 0.12
 _LEVELS = 16
+_UNKNOWN = "nothing tells where this arm has its encoders; they are simulated at the links"
 # Means at the end of the simulated part, under the transient of its filters.
 _END = 5
 
@@ -46,7 +48,7 @@ class MotionReplay:
     """A session with its simulation by one or two models.
 
     runs : by model. side : of the torque errors, `joint` where it is measured, else `motor`. notes : limits of the
-    simulation, a sentence each.
+    simulation, a sentence each. encoder : side of the elastic joints with the published positions.
     """
 
     session: str
@@ -55,6 +57,7 @@ class MotionReplay:
     runs: Mapping[Simulated, Replayed]
     side: Literal["joint", "motor"]
     notes: tuple[str, ...] = ()
+    encoder: Encoder = "link"
 
     @property
     def time(self) -> Floats:
@@ -114,6 +117,7 @@ class MotionReplay:
             "end_s": float(self.time[-1]),
             "side": self.side,
             "joints": self.arm.joint_names,
+            "encoder": self.encoder,
             "rms": {
                 model: {"position_rad": self.rms(model)[0], "torque_nm": self.rms(model)[1]}
                 for model in self.runs
@@ -155,7 +159,10 @@ def motion_replay(
         raise ConfigurationError(
             f"{source}: no arm file has these joints; name one with --arm, to draw the arm"
         )
-    replay = Replay(np.asarray(known.stiffness, dtype=float), others, longest_s=longest_s)
+    place = encoder_of(log, folder, models.values())
+    encoder: Encoder = place or "link"
+    stiffness = np.asarray(known.stiffness, dtype=float)
+    replay = Replay(stiffness, others, longest_s=longest_s, encoder=encoder)
     for one in models.values():
         if replay(one, [log]) is None:
             raise DataError(f"{log.path.name}: {'; '.join(replay.notes)}")
@@ -163,7 +170,8 @@ def motion_replay(
     side: Literal["joint", "motor"] = "motor" if runs["base"].joint is None else "joint"
     if getattr(runs["base"], side) is None:
         raise DataError(f"{log.path.name}: neither joint nor motor torque is in the log and the model")
-    return MotionReplay(log.path.stem, known, _payload(log), runs, side, replay.notes)
+    notes = (*replay.notes, *([_UNKNOWN] if place is None else []))
+    return MotionReplay(log.path.stem, known, _payload(log), runs, side, notes, encoder)
 
 
 def _without_end(done: Replayed) -> Replayed:
@@ -350,4 +358,6 @@ def _summary(shown: MotionReplay) -> str:
             for position, torque in found
         )
         lines.append(f"| {name} |{cells}")
-    return "\n".join([*lines, "", *shown.notes])
+    # A sentence each, as a paragraph.
+    place = () if _UNKNOWN in shown.notes else (f"encoders simulated at the {shown.encoder}s",)
+    return "\n".join(lines) + "".join(f"\n\n{note}" for note in (*place, *shown.notes))

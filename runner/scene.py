@@ -9,6 +9,8 @@ import io
 import logging
 import socket
 from contextlib import redirect_stdout
+from html import escape
+from importlib import resources
 from typing import Any
 
 import coal
@@ -29,8 +31,12 @@ JOINT: Colour = (0, 114, 178)
 GHOST: Colour = (0, 158, 115)
 ALARM: Colour = (213, 94, 0)
 CARRIED: Colour = (86, 86, 86)
-# The labels of viser's widgets are pale grey.
-_LEGIBLE = "<style>label, .mantine-Slider-markLabel { color: #343a40 !important; }</style>"
+# The texts of viser's widgets are pale, and its panel leaves a third of a telephone's width empty.
+_LEGIBLE = """
+label, .mantine-Slider-markLabel, .mantine-Notification-description { color: #343a40 !important; }
+.mantine-Button-root:not([data-disabled]) { background: #1864ab !important; }
+@media (max-width: 36em) { [style*="width: 20em"] { width: 100% !important; } }
+"""
 _DENSITY = 2700.0  # of a payload without shape, drawn as an aluminium ball [kg/m³]
 
 
@@ -53,10 +59,25 @@ def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
         server = viser.ViserServer(host=host, port=port, verbose=False)
     server.scene.set_up_direction("+z")
     server.scene.configure_default_lights(True, cast_shadow=False)
-    server.gui.add_html(_LEGIBLE)
+    server.gui.add_html(_widgets())
     server.initial_camera.position = (1.45, -1.35, 1.05)
     server.initial_camera.look_at = (0.0, 0.0, 0.45)
     return server
+
+
+def _widgets() -> str:
+    """HTML to mend the look of viser's widgets and give them names; a script element would not run there."""
+    return f"<style onload='{escape(_script(), quote=True)}'>{_LEGIBLE}</style>"
+
+
+def named_page(page: str) -> str:
+    """A page made by viser, its widgets with names."""
+    head, end, tail = page.rpartition("</body>")
+    return f"{head}<style>{_LEGIBLE}</style><script>{_script()}</script>{end}{tail}" if end else page
+
+
+def _script() -> str:
+    return resources.files("runner").joinpath("scene.js").read_text(encoding="utf-8")
 
 
 def stop_server(server: Any) -> None:

@@ -33,8 +33,8 @@ class InputPath(click.Path):
     def __init__(self) -> None:
         super().__init__(path_type=Path)
 
-    def require(self, path: Path) -> None:
-        """Raise ConfigurationError, with a name that is near, unless `path` exists."""
+    def require(self, path: Path, option: str = "") -> None:
+        """Raise ConfigurationError, with a name that is near, unless `path` exists. option : with that path."""
         try:
             path.stat()
         except FileNotFoundError:
@@ -49,7 +49,8 @@ class InputPath(click.Path):
                     if folder.is_dir()
                     else f"there is no folder {folder}; correct the path"
                 )
-            raise ConfigurationError(f"{path}: no such file or folder; {advice}") from None
+            subject = f"{option} {path}".strip()
+            raise ConfigurationError(f"{subject}: no such file or folder; {advice}") from None
         except OSError as error:
             raise FileError.of(error, f"{path} cannot be read") from error
 
@@ -157,7 +158,7 @@ class Verb(click.Command):
             if isinstance(parameter.type, OutputFile):
                 check_replacement(path, parameter.type, forced())
             elif isinstance(parameter.type, InputPath):
-                parameter.type.require(path)
+                parameter.type.require(path, parameter.opts[0] if isinstance(parameter, click.Option) else "")
         return super().invoke(ctx)
 
     def _paths(self, ctx: click.Context) -> Iterator[tuple[click.Parameter, Path]]:
@@ -183,6 +184,19 @@ gear_ratio_option = click.option(
 )
 
 
+def arm_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options of a diagnosis on its arm: `arm`, `urdf`, `coupling`, `gear_ratio`."""
+    about = "Arm file (stiffness, gear ratios); default: the one of the sessions' robot."
+    for option in (
+        gear_ratio_option,
+        coupling_option,
+        click.option("--urdf", type=PATH, help="Kinematics; default: the one in the first session."),
+        click.option("--arm", type=NAMED_FILE, help=about),
+    ):
+        command = option(command)
+    return command
+
+
 class GroupedCommand(Verb):
     """A command with its options under headings in the help.
 
@@ -195,7 +209,8 @@ class GroupedCommand(Verb):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, group by group."""
-        records = {parameter.name: parameter.get_help_record(ctx) for parameter in self.get_params(ctx)}
+        options = (one for one in self.get_params(ctx) if isinstance(one, click.Option))
+        records = {option.name: option.get_help_record(ctx) for option in options}
         shown = {name for names in self.groups.values() for name in names}
         rest = tuple(str(name) for name in records if name not in shown)
         for heading, names in (*self.groups.items(), ("Options", rest)):

@@ -250,7 +250,7 @@ class Session:
     def __repr__(self) -> str:
         data = self.metadata
         duration = f"{self.duration_s:.3f} s" if len(self.joint) else "empty"
-        recorded = f"{_utc(self.start)}, {duration}" if len(self.joint) else duration
+        recorded = f"{_clock(data, _utc(self.start))}, {duration}" if len(self.joint) else duration
         phases = ", ".join(dict.fromkeys(phase.name.split()[0] for phase in self.phases if phase.name))
         lines = [
             f"Session {self.path}",
@@ -398,6 +398,11 @@ class SessionSummary:
     end: Mapping[str, str] | None
     missing: tuple[str, ...]
 
+    @property
+    def recorded(self) -> str:
+        """Time of the first sample, in words."""
+        return _clock(self.metadata, self.utc_first)
+
     def as_dict(self) -> dict[str, Any]:
         """Plain data, for JSON."""
         return {**asdict(self), "path": str(self.path)}
@@ -412,7 +417,7 @@ class SessionSummary:
             f"  robot        {data.get('robot', 'unknown')} {data.get('serial', '')}".rstrip(),
             f"  payload      {self.payload}",
             f"  experiment   {data.get('experiment', '') or '-'}",
-            f"  recorded     {self.utc_first}, {self.duration_s:.3f} s",
+            f"  recorded     {self.recorded}, {self.duration_s:.3f} s",
             f"  ended        {status}{reason}",
             f"  motor torque {data.get('motor_torque_source', 'unknown')}",
             "",
@@ -515,6 +520,12 @@ def _rms(columns: JointColumns) -> tuple[float, ...]:
 def _payload(metadata: Mapping[str, str]) -> str:
     mass = f", {metadata['payload_mass']} kg" if metadata.get("payload_mass") else ""
     return f"{metadata.get('payload', 'unknown')}{mass}"
+
+
+def _clock(metadata: Mapping[str, str], utc: str) -> str:
+    """A time, unless it is that of an emulator in lock step: its clock starts with the year 2020."""
+    emulated = metadata.get("utc_start", "").startswith("2020-01-01T00:00:00")
+    return "emulated clock" if emulated else utc
 
 
 def _utc(log_time: int) -> str:

@@ -13,9 +13,8 @@ from runner.output import OUTPUT_FILE
 from runner.terminal import (
     NAMED_FILE,
     PATH,
-    coupling_option,
+    arm_options,
     default_file,
-    gear_ratio_option,
     json_option,
     to_json,
     verb,
@@ -48,14 +47,7 @@ _FIRST_SEED = 1001
     help="Number of sets: to record (default 3), or in SESSIONS, set after set (default 1).",
 )
 @click.option("--out", required=True, type=OUTPUT_FILE, help="Model file of the healthy arm.")
-@click.option(
-    "--arm",
-    type=NAMED_FILE,
-    help="Arm file (stiffness, gear ratios); default: the one of the sessions' robot.",
-)
-@click.option("--urdf", type=PATH, help="Kinematics; default: the one in the first session.")
-@coupling_option
-@gear_ratio_option
+@arm_options
 @click.option("--yes", is_flag=True, help="Confirm every question; for automation.")
 @click.option(
     "--allow-non-realtime", is_flag=True, help="Command the real arm without real-time rights; may stutter."

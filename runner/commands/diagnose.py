@@ -8,11 +8,9 @@ import click
 
 from runner.output import OUTPUT_FOLDER
 from runner.terminal import (
-    NAMED_FILE,
     PATH,
     GroupedCommand,
-    coupling_option,
-    gear_ratio_option,
+    arm_options,
     hold_json,
     json_option,
 )
@@ -35,14 +33,7 @@ _GROUPS = {
 @click.option("--model", type=PATH, help="Present model, the baseline of the simulation.")
 @click.option("--reference", type=PATH, help="Model of `lwr-run commission`, arm healthy.")
 @click.option("--out", required=True, type=OUTPUT_FOLDER, help="Folder of the results.")
-@click.option(
-    "--arm",
-    type=NAMED_FILE,
-    help="Arm file (stiffness, gear ratios); default: the one of the sessions' robot.",
-)
-@click.option("--urdf", type=PATH, help="Kinematics; default: the one in the first session.")
-@coupling_option
-@gear_ratio_option
+@arm_options
 @click.option(
     "--compare",
     nargs=2,

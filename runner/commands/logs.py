@@ -10,7 +10,7 @@ from fri.errors import ConfigurationError
 from lwr_driver.listing import Listing
 from runner.output import OUTPUT_FILE, OUTPUT_FOLDER, check_file, check_folder, default_output, set_aside
 from runner.status import answer
-from runner.terminal import NAMED_FILE, PATH, forced, json_option, tell, to_json, verb
+from runner.terminal import NAMED_FILE, PATH, forced, implied, json_option, tell, to_json, verb
 
 
 @verb("info")
@@ -219,6 +219,10 @@ def report_command(
         from runner.report.verdicts import headline, verdicts
         from runner.status import StatusLine
 
+        for name in ("suffix", "width", "columns", "joints", "statistics"):
+            if not implied(name):
+                option = "format" if name == "suffix" else name
+                raise click.UsageError(f"--{option} is for figures; add --figures FOLDER")
         check_folder(folder)
         status = StatusLine()
         status.show("writing the report")

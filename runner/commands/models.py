@@ -124,11 +124,11 @@ def compare_command(first: Path, second: Path, as_json: bool, level: float, repo
     result = compare(*models, level=level, labels=labels)
     page = None
     if report is not None:
-        from runner.report.comparison import comparison_html
+        from runner.report.comparison import Side, comparison_html
         from runner.report.page import write_page
 
-        runs = {str(place): place for place in (first, second) if (place / "summary.json").is_file()}
-        page = write_page(comparison_html(result, models[0].structure.chain.joint_names, runs), report)
+        sides = Side.both((first, second), (models[0], models[1]))
+        page = write_page(comparison_html(result, models[0].structure.chain.joint_names, sides), report)
     if as_json:
         click.echo(to_json(result.to_dict()))
     else:

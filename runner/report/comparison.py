@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import math
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ident.estimation.compare import Comparison, Difference
+from ident.model import DynamicModel
 from runner.computer import versions
 from runner.report.figure import Figure
+from runner.report.folder import ResultFolder
 from runner.report.markup import Cell, Number, figure_html, paragraph, section, table
 from runner.report.page import page_html
 from runner.report.plot import Line, Mark, Panel, Points
@@ -25,10 +27,44 @@ _NAMED = 3
 _WITHIN = 1.96
 
 
-def comparison_html(comparison: Comparison, joints: Sequence[str], runs: Mapping[str, Path]) -> str:
+@dataclass(frozen=True)
+class Side:
+    """One of the two models. place : model file, or a folder of results with one. name : short, on the page."""
+
+    place: Path
+    model: DynamicModel
+    name: str
+
+    @classmethod
+    def both(cls, places: tuple[Path, Path], models: tuple[DynamicModel, DynamicModel]) -> tuple[Side, Side]:
+        """The sides with names to tell them apart: of the arms, else the ends of their paths."""
+        robots = models[0].robot, models[1].robot
+        names = robots if all(robots) and robots[0] != robots[1] else short_names(*places)
+        return cls(places[0], models[0], names[0]), cls(places[1], models[1], names[1])
+
+    @property
+    def file(self) -> Path:
+        """The model file."""
+        return self.place / "model.yaml" if self.place.is_dir() else self.place
+
+
+def short_names(first: Path, second: Path) -> tuple[str, str]:
+    """The shortest ends of two paths that differ; a `model.yaml` goes with its folder, as every run has one."""
+    parts = []
+    for path in (Path(os.path.abspath(first)), Path(os.path.abspath(second))):
+        own = path.parts
+        parts.append((*own[:-2], "/".join(own[-2:])) if path.name == "model.yaml" and len(own) > 2 else own)
+    for count in range(1, max(map(len, parts)) + 1):
+        ends = [Path(*own[-count:]).as_posix() for own in parts]
+        if ends[0] != ends[1]:
+            return ends[0], ends[1]
+    return parts[0][-1], f"{parts[1][-1]} again"
+
+
+def comparison_html(comparison: Comparison, joints: Sequence[str], sides: tuple[Side, Side]) -> str:
     """The text of the page.
 
-    joints : their names. runs : folders of results by the label of their model, for their torque errors.
+    joints : their names. sides : the two models; the torque errors are of those in a folder of results.
     """
     changed = [one for one in comparison.differences if one.name in comparison.significant]
     level, sentence = _verdict(comparison, changed)
@@ -41,22 +77,31 @@ def comparison_html(comparison: Comparison, joints: Sequence[str], runs: Mapping
         lines.append(
             Verdict("all together", found, "p above 0.05", "good" if comparison.p > 0.05 else "look")
         )
-    content = section("differences", "Differences", _figure(comparison, joints), _table(comparison))
+    first, second = sides
+    content = section("differences", "Differences", _figure(comparison, joints), _table(comparison, sides))
+    runs = [side for side in sides if (side.place / "summary.json").is_file()]
     if runs:
         content += section("errors", "Torque errors of the runs", *_errors(runs))
-    for title, names in (
-        (f"Only in {comparison.first}", comparison.only_first),
-        (f"Only in {comparison.second}", comparison.only_second),
-    ):
-        if names:
-            content += section("only", title, paragraph(" ".join(names)))
+    only = [
+        paragraph(f"Only in {side.name}: {' '.join(names)}")
+        for side, names in ((first, comparison.only_first), (second, comparison.only_second))
+        if names
+    ]
+    if only:
+        content += section("only", "Only in one", *only)
+    content += section("provenance", "Provenance", _provenance(sides))
     return page_html(
         "Comparison",
-        escape(f"{comparison.first} and {comparison.second}"),
+        escape(f"{first.name} and {second.name}"),
         (level, sentence),
         lines,
         content,
-        [("differences", "Differences"), ("errors", "Torque errors"), ("only", "Only in one")],
+        [
+            ("differences", "Differences"),
+            ("errors", "Torque errors"),
+            ("only", "Only in one"),
+            ("provenance", "Provenance"),
+        ],
         str(versions()["software"]),
     )
 
@@ -77,12 +122,12 @@ def _words(one: Difference) -> str:
     return f"{one.first:.4g} to {one.second:.4g} {one.unit}{size}, {abs(one.z):.1f} standard deviations"
 
 
-def _table(comparison: Comparison) -> str:
+def _table(comparison: Comparison, sides: tuple[Side, Side]) -> str:
     head = (
         "parameter",
-        comparison.first,
+        sides[0].name,
         "±",
-        comparison.second,
+        sides[1].name,
         "±",
         "unit",
         "difference [%]",
@@ -140,18 +185,32 @@ def _figure(comparison: Comparison, names: Sequence[str]) -> str:
     return figure_html(Figure("differences", "Differences in standard deviations", tuple(panels)), tall=True)
 
 
-def _errors(runs: Mapping[str, Path]) -> list[str]:
+def _errors(runs: Sequence[Side]) -> list[str]:
     """Torque errors on held-out sessions, of each run with results."""
     rows: list[list[Cell]] = []
-    for label, folder in runs.items():
-        summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    for side in runs:
+        summary = ResultFolder.load(side.place).summary
         for one in summary.get("validation") or []:
             error = one.get("torque_error") or {}
             shares = [error.get(side) for side in ("motor", "joint")]
             # Shares of the torque's root mean square.
             cells = [Number(None if share is None else 100.0 * share, ".2f") for share in shares]
-            rows.append([label, str(one.get("session", "")), *cells])
+            rows.append([side.name, str(one.get("session", "")), *cells])
     if not rows:
         return [paragraph("Neither run has a held-out session.")]
     head = ("run", "held-out session", "motor [%]", "joint [%]")
     return [table(head, rows, "Torque error of all samples on held-out sessions")]
+
+
+def _provenance(sides: Sequence[Side]) -> str:
+    """Where each model comes from."""
+    rows: list[list[Cell]] = []
+    for side in sides:
+        known = side.model.provenance
+        made = [str(known.get(key, "")) for key in ("estimator", "software")]
+        logs = [one.get("file", "") if isinstance(one, dict) else one for one in known.get("sessions") or ()]
+        rows.append(
+            [side.name, os.path.abspath(side.file), side.model.robot, *made, ", ".join(map(str, logs))]
+        )
+    head = ("model", "file", "arm", "estimator", "software", "sessions")
+    return table(head, rows, "The two models", classes="paths")

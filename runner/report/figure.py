@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -20,26 +21,23 @@ _SCREEN_FONT = "DejaVu Sans"  # comes with matplotlib
 
 
 @dataclass(frozen=True)
-class Figure:
-    """Small multiples under one caption. A notebook shows it by itself.
+class Drawing(ABC):
+    """A figure with its caption. A notebook shows it by itself.
 
     name : for file names and anchors.
     """
 
     name: str
     caption: str
-    panels: tuple[Panel, ...] = field(repr=False)
 
     @property
+    @abstractmethod
     def alt(self) -> str:
         """Description in sentences, for screen readers."""
-        return " ".join(panel.alt for panel in self.panels)
 
-    @property
-    def legend(self) -> tuple[tuple[Role, str, str], ...]:
-        """Role, label and kind (`Line`, `Band`, `Points`) of all marks, each once."""
-        marks = (mark for panel in self.panels for mark in panel.marks if mark.label)
-        return tuple(dict.fromkeys((mark.role, mark.label, type(mark).__name__) for mark in marks))
+    @abstractmethod
+    def _draw(self, width: str | float, columns: int | None, statistics: bool, shown: bool) -> NDArray[Any]:
+        """The matplotlib axes; shown : known to pyplot."""
 
     def plot(
         self, width: str | float = "ieee-wide", *, columns: int | None = None, statistics: bool = False
@@ -47,10 +45,10 @@ class Figure:
         """The matplotlib axes of the n panels, (n,); (n, 2) if panels have a lower part. Change them as you like.
 
         width : `ieee`, `ieee-wide`, `ifac`, `ifac-wide` or [mm]. columns : panels side by side; default: as many as
-        stay legible. statistics : numbers such as the rms beside the title of each panel.
-        `plot()[0].figure.savefig(...)` writes a changed figure.
+        stay legible. statistics : numbers such as the rms beside the title of each panel. A matrix is one panel
+        without statistics. `plot()[0].figure.savefig(...)` writes a changed figure.
         """
-        return draw_panels(self.panels, width, columns=columns, statistics=statistics, shown=True)
+        return self._draw(width, columns, statistics, True)
 
     def save(
         self,
@@ -65,29 +63,49 @@ class Figure:
         ConfigurationError for another suffix, a missing folder or an unknown width.
         """
         target = checked_target(path)
-        axes = draw_panels(self.panels, width, columns=columns, statistics=statistics)
+        axes = self._draw(width, columns, statistics, False)
         return write_figure(axes.flat[0].figure, target, self.caption, self.alt)
+
+    def _repr_png_(self) -> bytes:
+        figure = self._draw("ieee-wide", None, False, False).flat[0].figure
+        stream = io.BytesIO()
+        with paper_style():
+            figure.savefig(stream, format="png", dpi=160)
+        return stream.getvalue()
+
+
+@dataclass(frozen=True)
+class Figure(Drawing):
+    """Small multiples under one caption."""
+
+    panels: tuple[Panel, ...] = field(repr=False)
+
+    @property
+    def alt(self) -> str:
+        """Description in sentences, for screen readers."""
+        return " ".join(panel.alt for panel in self.panels)
+
+    @property
+    def legend(self) -> tuple[tuple[Role, str, str], ...]:
+        """Role, label and kind (`Line`, `Band`, `Points`) of all marks, each once."""
+        marks = (mark for panel in self.panels for mark in panel.marks if mark.label)
+        return tuple(dict.fromkeys((mark.role, mark.label, type(mark).__name__) for mark in marks))
 
     def plotly(self, *, columns: int = 2) -> Any:
         """The figure as a plotly `Figure` with one subplot a panel; needs the extra `view`."""
         return plotly_figure(self.panels, columns=columns)
 
-    def _repr_png_(self) -> bytes:
-        return _png(draw_panels(self.panels).flat[0].figure)
+    def _draw(self, width: str | float, columns: int | None, statistics: bool, shown: bool) -> NDArray[Any]:
+        return draw_panels(self.panels, width, columns=columns, statistics=statistics, shown=shown)
 
 
 @dataclass(frozen=True, eq=False)
-class MatrixFigure:
-    """A symmetric matrix (n, n) of values from -1 to 1 with its n names. A notebook shows it by itself.
+class MatrixFigure(Drawing):
+    """A symmetric matrix (n, n) of values from -1 to 1 with its n names. alt : description in a sentence."""
 
-    name : for file names. alt : description in a sentence, for screen readers.
-    """
-
-    name: str
-    caption: str
     names: tuple[str, ...]
     values: Floats = field(repr=False)
-    alt: str
+    alt: str = ""
 
     def strongest(self, count: int) -> list[tuple[str, str, float]]:
         """The `count` pairs of different parameters with the largest magnitude, largest first."""
@@ -100,31 +118,12 @@ class MatrixFigure:
         """As plotly `data` and `layout`."""
         return heatmap_chart(self.names, self.values)
 
-    def plot(
-        self, width: str | float = "ieee-wide", *, columns: int | None = None, statistics: bool = False
-    ) -> NDArray[Any]:
-        """The matplotlib axes, (1,); width as of `Figure.plot`, the other arguments have no effect."""
-        return np.array([draw_matrix(self.names, self.values, DIVERGING, width, shown=True)], dtype=object)
-
-    def save(
-        self,
-        path: str | Path,
-        width: str | float = "ieee-wide",
-        *,
-        columns: int | None = None,
-        statistics: bool = False,
-    ) -> Path:
-        """Write the matrix, as `Figure.save` writes panels."""
-        target = checked_target(path)
-        axes = draw_matrix(self.names, self.values, DIVERGING, width)
-        return write_figure(axes.figure, target, self.caption, self.alt)
-
     def plotly(self, *, columns: int = 1) -> Any:
         """The matrix as a plotly `Figure`; needs the extra `view`."""
         return heatmap_figure(self.chart(), self.caption)
 
-    def _repr_png_(self) -> bytes:
-        return _png(draw_matrix(self.names, self.values, DIVERGING).figure)
+    def _draw(self, width: str | float, columns: int | None, statistics: bool, shown: bool) -> NDArray[Any]:
+        return np.array([draw_matrix(self.names, self.values, DIVERGING, width, shown=shown)], dtype=object)
 
 
 def inline_svg(panel: Panel, width: float = 105.0) -> str:
@@ -136,10 +135,3 @@ def inline_svg(panel: Panel, width: float = 105.0) -> str:
     text = stream.getvalue()
     head = f"<svg role='img' style='width:100%;height:auto' aria-label='{escape(panel.alt, quote=True)}' "
     return text[text.index("<svg") :].replace("<svg ", head, 1)
-
-
-def _png(figure: Any) -> bytes:
-    stream = io.BytesIO()
-    with paper_style():
-        figure.savefig(stream, format="png", dpi=160)
-    return stream.getvalue()

@@ -164,7 +164,7 @@ def parameter_figure(results: Results) -> Figure:
     """
     folder = _folder(results)
     entries = folder.summary.get("parameters", [])
-    published = {entry.name: entry.estimate for entry in TABLE_2}
+    published = {entry.name: entry.estimate for entry in TABLE_2 if folder.published_arm}
     links = tuple(dict.fromkeys(_link(entry["name"]) for entry in entries))
     links = tuple(sorted((link for link in links if link.isdigit()), key=int))
     panels = []

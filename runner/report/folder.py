@@ -23,6 +23,7 @@ from ident.model.signals import signal_settings
 from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepare import Passage, PreparedSession
 from lwr_driver.session import Session, read_session
+from runner.published import is_published_arm
 
 Floats = NDArray[np.float64]
 
@@ -191,6 +192,11 @@ class ResultFolder:
         """The identified model, or None."""
         file = self.path / "model.yaml"
         return read_model(file) if file.is_file() else None
+
+    @cached_property
+    def published_arm(self) -> bool:
+        """Whether the published tables are of this kind of arm."""
+        return self.model is None or is_published_arm(self.model.structure.chain)
 
     @cached_property
     def sessions(self) -> dict[str, Session]:

@@ -54,15 +54,16 @@ def parameter_table(results: Results, *, columns: int = 1) -> str:
 
 
 def save_tables(results: Results, folder: str | Path) -> list[Path]:
-    """Write `table_1.tex`, `table_2.tex` and `parameters.tex`; none for a run without estimate."""
+    """Write `table_1.tex`, `table_2.tex` and `parameters.tex`; none for a run without estimate.
+
+    The first two are for the arm of the paper alone.
+    """
     results = _folder(results)
     if not results.summary.get("parameters"):
         return []
-    texts = {
-        "table_1.tex": table_1(results),
-        "table_2.tex": table_2(results),
-        "parameters.tex": parameter_table(results, columns=2),
-    }
+    texts = {"parameters.tex": parameter_table(results, columns=2)}
+    if results.published_arm:
+        texts = {"table_1.tex": table_1(results), "table_2.tex": table_2(results)} | texts
     paths = [Path(folder) / name for name in texts]
     for path, text in zip(paths, texts.values(), strict=True):
         path.write_text(text, encoding="utf-8")

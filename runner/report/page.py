@@ -131,7 +131,7 @@ def page_html(
         f"<style>{_asset('page.css')}</style></head>"
         f"<body><header><h1>{subtitle}</h1><p class=verdict>{_badge(level)}"
         f"<span>{escape(sentence)}</span></p>"
-        f"{_verdict_table(lines)}<nav aria-label='Parts of the report'>{links}</nav></header>"
+        f"{_verdict_table(lines, content)}<nav aria-label='Parts of the report'>{links}</nav></header>"
         f"<main>{content}</main>"
         f"<footer>Written by {escape(software)}. This file needs no network; print it or keep it beside the logs."
         "</footer>"
@@ -158,11 +158,12 @@ def _subtitle(results: ResultFolder) -> str:
     return " · ".join(escape(part) for part in parts if part)
 
 
-def _verdict_table(lines: Sequence[Verdict]) -> str:
+def _verdict_table(lines: Sequence[Verdict], content: str) -> str:
     rows = []
     for line in lines:
         subject = escape(line.subject)
-        linked = f"<a href='#{line.section}'>{subject}</a>" if line.section else subject
+        there = line.section and f"<section id='{line.section}'" in content
+        linked = f"<a href='#{line.section}'>{subject}</a>" if there else subject
         rows.append(
             f"<tr><th scope=row>{linked}</th><td>{escape(line.found)}</td>"
             f"<td class=wanted>{escape(line.wanted)}</td><td class=mark>{_badge(line.level)}</td></tr>"

@@ -81,7 +81,7 @@ def session_section(results: ResultFolder) -> str:
 
 def table_1_section(results: ResultFolder) -> str:
     """The paper's Table 1 with this run in it."""
-    if not results.summary.get("parameters"):
+    if not (results.summary.get("parameters") and results.published_arm):
         return ""
     condition = results.summary.get("excitation", {}).get("condition", {})
     shown = tables.table_1(results)
@@ -112,7 +112,7 @@ def table_1_section(results: ResultFolder) -> str:
 
 def table_2_section(results: ResultFolder) -> str:
     """The paper's Table 2 beside the estimates of this run."""
-    if not results.summary.get("parameters"):
+    if not (results.summary.get("parameters") and results.published_arm):
         return ""
     essential = (results.summary.get("essential") or {}).get("parameters", [])
     kept = {entry["name"]: (entry, f"essential.parameters.{i}") for i, entry in enumerate(essential)}

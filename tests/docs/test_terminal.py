@@ -219,6 +219,17 @@ def test_options_of_one_name_are_of_one_kind_and_of_one_style() -> None:
 
 
 @pytest.mark.parametrize("name", VERBS)
+def test_arguments_stand_in_the_usage_alone(name: str) -> None:
+    command = verb(name)
+    page = command.get_help(click.Context(command, info_name=name))
+    entries = {line.strip() for line in page.splitlines()}
+    usages = {
+        one.make_metavar(click.Context(command)) for one in command.params if isinstance(one, click.Argument)
+    }
+    assert not entries & usages
+
+
+@pytest.mark.parametrize("name", VERBS)
 def test_every_option_has_a_help_text_and_a_sentence_of_its_own(name: str) -> None:
     command = verb(name)
     assert command.help

@@ -133,6 +133,24 @@ def test_a_line_fits_every_width() -> None:
     assert "missed 0" in line.text(120).plain
 
 
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("identfy", "did you mean 'identify'?"),
+        ("report . --fromat pdf", "Did you mean '--format'?"),
+        ("report . --format pgf", "--format is for figures; add --figures FOLDER"),
+        ("check experimnt.yaml", "did you mean experiment.yaml?"),
+        ("trend", "--store fleet: no such file or folder"),
+    ],
+)
+def test_a_slip_of_the_pen_is_told_within_a_narrow_screen(line: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "experiment.yaml").write_text("name: own\n")
+    seen = watch(40, [LWR_RUN, *line.split()], tmp_path)
+    assert seen.code == 2
+    assert said in " ".join(" ".join(seen.text).split())
+    assert seen.screen.broken == []
+
+
 def test_a_long_path_is_broken_so_that_a_shell_takes_it() -> None:
     path = "experiments/lwr4plus-20260101-120000/report.html"
     for width in (40, 50, 60):

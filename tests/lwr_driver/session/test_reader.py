@@ -75,6 +75,15 @@ def test_description_in_words_and_as_data(tmp_path):
         assert word in text
 
 
+def test_the_clock_of_an_emulator_is_no_date(tmp_path):
+    path = tmp_path / "a.mcap"
+    start = 1_577_836_800 * 10**9
+    write_session(path, metadata={**METADATA, "utc_start": "2020-01-01T00:00:00+00:00"}, start=start)
+    for text in (str(describe(path)), repr(read_session(path))):
+        assert "emulated clock, 1.999 s" in text
+        assert "2020" not in text
+
+
 def ros_session(path, messages, *, topic="/joint_states", **options):
     """A log of another tool, written with `mcap_ros2`; messages are (log time, JointState dict)."""
     with open(path, "wb") as file:

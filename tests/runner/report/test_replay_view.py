@@ -17,11 +17,14 @@ from PIL import Image
 from playwright.sync_api import Browser
 
 from fri.errors import ConfigurationError
+from ident.diagnosis.reference import Reference
 from ident.model.model_file import read_model, write_model
 from runner.cli import main
+from runner.encoder import encoder_of
 from runner.replay_video import frames, write_video
 from runner.replay_view import MotionReplay, error_colour, motion_replay
-from tests.runner.report.view_rig import VISER, flaws, opened
+from runner.report.folder import ResultFolder
+from tests.runner.report.view_rig import CLIPPED, NARROW, WIDE, flaws, opened
 
 pytestmark = pytest.mark.slow
 
@@ -80,6 +83,55 @@ def test_the_part_shown_is_that_of_the_log(shown: MotionReplay, finished: Path) 
     assert np.diff(shown.time) == pytest.approx(0.02)
 
 
+def test_the_encoders_are_simulated_where_the_arm_has_them(finished: Path, tmp_path: Path) -> None:
+    model = read_model(finished / "model.yaml")
+    log = ResultFolder.load(finished).sessions["check"]
+    text = log.attachments["experiment.yaml"].decode()
+    assert encoder_of(log, finished, [model]) == "link"
+    assert encoder_of(log, tmp_path, [model]) == "link"
+    moved = text.replace("emulator_settings: {", "emulator_settings: {sensors.position_sensor: motor, ")
+    emulated = replace(log, attachments={"experiment.yaml": moved.encode()})
+    assert encoder_of(emulated, tmp_path, [model]) == "motor"
+    real = replace(
+        log,
+        attachments={
+            "experiment.yaml": text.replace("name:", "backend: fri\nlock_step: false\nname:").encode()
+        },
+    )
+    assert encoder_of(real, tmp_path, [model]) is None
+    n = len(model.structure.chain.joint_names)
+    healthy = Reference(model, np.full(n, 1e-4), 0.0, 0.0, {}, {}, 3, encoder="motor")
+    commissioned = replace(model, provenance={**model.provenance, **healthy.stored()})
+    assert encoder_of(real, tmp_path, [commissioned]) == "motor"
+    gap = {
+        "gap": {"value": 1e-3, "std": 1e-4, "unit": "rad"},
+        "width": {"value": 1.0, "std": 0.1, "unit": "Nm"},
+    }
+    effect = {"cause": "backlash", "joints": [3], "form": "encoder at the motor", "parameters": gap}
+    found = replace(model, effects=(effect,))
+    assert encoder_of(real, tmp_path, [model, found]) == "motor"
+
+
+def test_a_log_that_does_not_tell_the_place_of_the_encoders_says_so(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    linked = motion_replay(finished, longest_s=2.0)
+    assert linked.facts()["encoder"] == "link"
+    assert not any("encoders" in note for note in linked.notes)
+    monkeypatch.setattr("runner.replay_view.encoder_of", lambda *_: None)
+    unknown = motion_replay(finished, longest_s=2.0)
+    assert [note for note in unknown.notes if "encoders" in note] == [
+        "nothing tells where this arm has its encoders; they are simulated at the links"
+    ]
+    monkeypatch.setattr("runner.replay_view.encoder_of", lambda *_: "motor")
+    turned = motion_replay(finished, longest_s=2.0)
+    before, after = linked.runs["base"].position, turned.runs["base"].position
+    assert before is not None
+    assert after is not None
+    assert turned.facts()["encoder"] == "motor"
+    assert np.abs(after - before).max() > 1e-4
+
+
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
 def test_a_video_has_frames_that_differ(shown: MotionReplay, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"replay{suffix}"
@@ -133,7 +185,7 @@ def test_a_browser_scrubs_through_the_replay(finished: Path, heavier: Path, chro
         address = process.stdout.readline().strip()
         try:
             assert address == "http://127.0.0.1:18231"
-            with opened(chrome, address, (900, 360)) as seen:
+            with opened(chrome, address, (WIDE[0], 360)) as seen:
                 page = seen.page
                 page.get_by_label("play").uncheck(timeout=120_000)
                 time_s = page.locator("input[inputmode=decimal], input[type=number]").first
@@ -157,7 +209,12 @@ def test_a_browser_scrubs_through_the_replay(finished: Path, heavier: Path, chro
                 page.wait_for_timeout(500)
                 extended = torque_errors(page.inner_text("body"))
                 assert page.evaluate(DRAWN) > 100
-                assert {flaw.split(",")[0] for flaw in flaws(seen)} <= VISER
+                for width in (WIDE[0], NARROW[0]):
+                    page.set_viewport_size({"width": width, "height": 360})
+                    page.wait_for_timeout(500)
+                    assert page.get_by_role("slider", name="time [s]").count() == 1
+                    assert flaws(seen) == []
+                    assert page.evaluate(CLIPPED) == []
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 0
         finally:

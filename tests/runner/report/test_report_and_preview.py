@@ -32,7 +32,7 @@ from runner.report.latex import table_1
 from runner.report.page import write_report
 from runner.report.tables import better_than_published
 from runner.report.verdicts import headline, verdicts
-from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, Seen, flaws, opened
+from tests.runner.report.view_rig import CLIPPED, CONTRAST, NARROW, WIDE, Seen, flaws, opened
 
 pytestmark = pytest.mark.slow
 
@@ -443,13 +443,16 @@ def test_the_preview_server_shows_the_motion_until_ctrl_c(finished: Path, chrome
             second = CliRunner().invoke(main, ["preview", str(finished), "--serve", "--port", port])
             assert second.exit_code == 2
             assert f"port {port} of 127.0.0.1 is in use" in second.output
-            with opened(chrome, said[1], (900, 300)) as seen:
+            with opened(chrome, said[1], (WIDE[0], 300)) as seen:
                 seen.page.get_by_role("button", name="go to the tightest moment").click(timeout=120_000)
                 seen.page.get_by_text("Tightest moment:").wait_for()
                 text = seen.page.inner_text("body")
                 assert colours_of(seen.page, seen.page.locator("canvas").first.bounding_box()) > 200
-                assert seen.errors == []
-                assert seen.external == []
+                for width in (WIDE[0], NARROW[0]):
+                    seen.page.set_viewport_size({"width": width, "height": 300})
+                    seen.page.wait_for_timeout(500)
+                    assert flaws(seen) == []
+                    assert seen.page.evaluate(CLIPPED) == []
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 0
         finally:

@@ -20,9 +20,11 @@ from ident.dynamics.structure import Coulomb
 from ident.model import read_model, write_model
 from lwr_driver.session import read_session
 from runner.cli import main
-from runner.report.figures import STRONG, correlation_figure
+from runner.published import is_published_arm
+from runner.report.figures import STRONG, correlation_figure, parameter_figure
 from runner.report.folder import ResultFolder
-from runner.report.page import write_report
+from runner.report.latex import save_tables
+from runner.report.page import report_html, write_report
 from runner.report.verdicts import headline, verdicts
 from tests.runner.report.view_rig import NARROW, opened
 
@@ -80,6 +82,35 @@ def test_logs_alone_have_a_report_without_an_experiment(imported: Path, chrome: 
             "check, joint torque, held out",
             "log, joint torque",
         ]
+
+
+@pytest.mark.parametrize(
+    ("change", "same"),
+    [
+        ({}, True),
+        ({"r": [0.0, 0.0, 0.4, 0.0, 0.39, 0.0, 0.078], "gravity": [0.0, 9.81, 0.0]}, True),
+        ({"r": [0.36, 0.0, 0.42, 0.0, 0.4, 0.0, 0.0]}, False),
+    ],
+)
+def test_the_arm_of_the_paper_is_known_by_its_joints(finished: Path, change: dict, same: bool) -> None:
+    chain = read_model(finished / "model.yaml").structure.chain
+    arrays = {name: np.array(values) for name, values in change.items()}
+    assert is_published_arm(replace(chain, **arrays)) == same
+
+
+def test_another_arm_is_not_compared_with_the_published_tables(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = ResultFolder.load(finished)
+    assert "#table-2" in report_html(results)
+    assert "published" in {role for role, _, _ in parameter_figure(results).legend}
+    monkeypatch.setitem(vars(results), "published_arm", False)
+    text = report_html(results)
+    assert "id='parameters'" in text
+    assert "Table 1" not in text
+    assert "table-2" not in text
+    assert "published" not in {role for role, _, _ in parameter_figure(results).legend}
+    assert [path.name for path in save_tables(results, tmp_path)] == ["parameters.tex"]
 
 
 def test_the_summary_of_logs_is_that_of_an_experiment(imported: Path) -> None:

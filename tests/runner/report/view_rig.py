@@ -105,15 +105,11 @@ CUT = """() => [...document.querySelectorAll('body *')].filter((node) => {
 """What reaches beyond the window outside of boxes that scroll or clip."""
 
 
-VISER = {
-    "aria-input-field-name",
-    "aria-progressbar-name",
-    "button-name",
-    "image-alt",
-    "label",
-    "scrollable-region-focusable",
-}
-"""Violations by the widgets of viser itself: sliders and bars without a name, its notice on software rendering."""
+CLIPPED = """() => [...document.querySelectorAll('body *')].filter((node) => {
+  if (node.scrollWidth <= node.clientWidth + 1 || !node.clientWidth || !node.childNodes.length) return false;
+  return ['auto', 'scroll', 'hidden'].includes(getComputedStyle(node).overflowX);
+}).map((node) => node.outerHTML.slice(0, 80))"""
+"""What clips or scrolls its content sideways."""
 
 
 def flaws(seen: Seen) -> list[str]:
@@ -125,10 +121,13 @@ def flaws(seen: Seen) -> list[str]:
         found.append(f"{width[0]} px wide in a window of {width[1]} px")
     found += [f"cut off: {html}" for html in page.evaluate(CUT)]
     axe = resources.files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8")
-    page.evaluate(axe)
-    result = page.evaluate("axe.run(document, {resultTypes: ['violations'], preload: false})")
-    for violation in result["violations"]:
-        if violation["impact"] in ("serious", "critical"):
-            first = violation["nodes"][0]
-            found.append(f"{violation['id']}, {len(violation['nodes'])} times: {first['html'][:120]}")
+    for frame in page.frames:
+        frame.evaluate(axe)
+        result = frame.evaluate(
+            "axe.run(document, {resultTypes: ['violations'], preload: false, iframes: false})"
+        )
+        for violation in result["violations"]:
+            if violation["impact"] in ("serious", "critical"):
+                first = violation["nodes"][0]
+                found.append(f"{violation['id']}, {len(violation['nodes'])} times: {first['html'][:120]}")
     return found
