@@ -1,9 +1,9 @@
 """What the diagnosis says of recordings of real arms that others published, and what it gains; printed by
 `python -m benchmarks.real_data`.
 
-LWR4+: joint torque sensors, low-passed at 2 Hz by the source (github kjyv/FloBaRoID). TX40: motor torques of six
-joints at 5 kHz (github thanhndv212/figaroh-examples). iiwa 14: constant-velocity sweeps of one joint, torque
-sensors (github HarvardAgileRoboticsLab/drake).
+The arms of `benchmarks.real_arms`, and two more. TX40: motor torques of six joints at 5 kHz (github
+thanhndv212/figaroh-examples). iiwa 14: constant-velocity sweeps of one joint, torque sensors (github
+HarvardAgileRoboticsLab/drake).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.real_arms import ARMS, low_passed_error
+from fri.errors import LwrError
 from ident.diagnosis import ArmData, Diagnosis, diagnose
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling
@@ -25,7 +26,7 @@ from ident.import_log import LogMapping, import_log
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
 
-__all__ = ["iiwa14", "lwr4", "tx40", "xmate"]
+__all__ = ["iiwa14", "tx40", "unseen"]
 
 _SWEEPS = {
     "joint 4, 0.2 rad/s": ("joint4/vel_p2",),
@@ -34,32 +35,35 @@ _SWEEPS = {
 }
 
 
-def lwr4(data: Any) -> None:
-    """Both splits with the same settings, the relative error before and after."""
-    arm = Arm.load("lwr4plus.yaml")
-    known = ArmData(arm.stiffness, arm.gear_ratio.astype(float))
-    for train, test in (((1, 2), 3), ((3,), 1)):
-        start = time.process_time()
-        found = diagnose(data.sessions(train), data.chain(), test=data.sessions((test,)), arm=known)
-        _show(f"LWR4+, runs {', '.join(map(str, train))}, measured on run {test}", found, start)
-        before, after = (data.model_relative(m, test) for m in (found.base_model, found.extended_model))
-        print(f"  relative error over all joints {before:.2f} % -> {after:.2f} %")
+def unseen(data: Path) -> None:
+    """Every arm of `benchmarks.real_arms` diagnosed with the defaults, measured on a motion that it has not seen.
 
-
-def xmate(folder: Path) -> None:
-    """Runs 1 and 2, measured on run 3, torques low-passed as in the comparison of the estimators."""
-    arm = next(arm for arm in ARMS if arm.folder == folder.name)
-    chain = Chain.from_urdf(folder / arm.urdf)
-    sessions = arm.read(folder, chain)
-    for train, test in arm.splits:
-        start = time.process_time()
-        found = diagnose([sessions[name] for name in train], chain, test=[sessions[test]])
-        _show(f"{arm.title}, runs {', '.join(train)}, measured on run {test}", found, start)
-        for band in (2.0, 10.0):
-            before, after = (
-                low_passed_error(m, sessions[test], band) for m in (found.base_model, found.extended_model)
-            )
-            print(f"  relative error over all joints below {band:g} Hz: {before:.2f} % -> {after:.2f} %")
+    The LWR4+ has the stiffness and the gear ratios of its file, the others those of none.
+    """
+    for arm in ARMS:
+        folder = data / arm.folder
+        if not folder.is_dir():
+            print(f"\n{arm.title}: no recordings in {folder}")
+            continue
+        ours = Arm.load("lwr4plus.yaml")
+        chain = Chain.from_urdf(folder / arm.urdf if arm.urdf else ours.urdf)
+        known = None if arm.urdf else ArmData(ours.stiffness, ours.gear_ratio.astype(float))
+        sessions = arm.read(folder, chain)
+        for train, test in arm.splits:
+            start = time.process_time()
+            title = f"{arm.title}, {', '.join(train)}, measured on {test}"
+            try:
+                found = diagnose([sessions[name] for name in train], chain, test=[sessions[test]], arm=known)
+            except LwrError as error:
+                print(f"\n{title}: {type(error).__name__}: {error}")
+                continue
+            _show(title, found, start)
+            for band in (2.0, 10.0):
+                before, after = (
+                    low_passed_error(m, sessions[test], band)
+                    for m in (found.base_model, found.extended_model)
+                )
+                print(f"  relative error over all joints below {band:g} Hz: {before:.2f} % -> {after:.2f} %")
 
 
 def tx40(folder: Path) -> None:
@@ -97,15 +101,23 @@ def _imported(mapping: str, source: Path) -> Session:
 
 def _show(title: str, found: Diagnosis, start: float) -> None:
     print(f"\n{title} (CPU {time.process_time() - start:.0f} s)")
-    for finding in found.findings:
-        print(finding)
+    for broken in found.data:
+        print(f"  broken: {broken}")
+    for heading, claims in (("finding", found.findings), ("character", found.character)):
+        for claim in claims:
+            print(f"{heading}: {claim}")
+    for term in found.nameless:
+        print(
+            f"  without a name: {term.side} torque of joint {term.joint} depends on {', '.join(term.depends_on)} "
+            f"({term.test_rms_before:.3g} -> {term.test_rms_after:.3g} Nm)"
+        )
     for rest in found.unexplained:
         print(
             f"  unexplained: {rest.side} torque of joint {rest.joint} depends on {', '.join(rest.depends_on)} "
             f"({rest.test_rms:.3g} Nm, floor {rest.noise_floor:.3g} Nm)"
         )
-    if not found.findings and not found.unexplained:
-        print("  nothing")
+    for note in found.notes:
+        print(f"  note: {note}")
     for side in found.rms_base:
         tables: Sequence[tuple[str, Any]] = (
             ("floor", found.noise_floor[side]),

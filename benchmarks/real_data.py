@@ -6,7 +6,7 @@ torque sensors, 25 s a run. Runs 1 and 2 repeat one trajectory, run 3 is another
 
 `lwr-run identify` as it comes on every arm stands first (`real_arms.py`).
 
-The diagnosis of these runs follows, and of the xMate, TX40 and iiwa 14 recordings beside them (`real_cases.py`).
+The diagnosis follows, of every arm with recordings beside these (`real_cases.py`).
 
 Each estimate is made with the settings as they come, from the training runs alone. The score is the one that
 others use on these files: the file's own q, qd, qdd, all samples from the first to the last, every ninth,
@@ -20,7 +20,7 @@ import dataclasses
 import os
 
 from benchmarks.real_arms import defaults
-from benchmarks.real_cases import iiwa14, lwr4, tx40, xmate
+from benchmarks.real_cases import iiwa14, tx40, unseen
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -230,7 +230,8 @@ def main(arguments: Sequence[str]) -> int:
         print(f"no recordings in {folder}: fetch them (see the head of this file) and name them with --data")
         return 2
     start = time.process_time()
-    defaults(folder.parent)
+    if not wanted.diagnosis_only:
+        defaults(folder.parent)
     if wanted.defaults_only:
         print(f"\nCPU {time.process_time() - start:.1f} s")
         return 0
@@ -238,8 +239,8 @@ def main(arguments: Sequence[str]) -> int:
     if not wanted.diagnosis_only:
         for table in (held_out, per_joint, honesty, priors, tilts):
             table(data)
-    lwr4(data)
-    for name, case in (("xmate7p", xmate), ("tx40", tx40), ("iiwa14", iiwa14)):
+    unseen(folder.parent)
+    for name, case in (("tx40", tx40), ("iiwa14", iiwa14)):
         if (folder.parent / name).is_dir():
             case(folder.parent / name)
         else:
