@@ -11,7 +11,7 @@ from __future__ import annotations
 import tarfile
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,9 @@ _SWEEPS = {
 }
 
 
-def unseen(data: Path) -> None:
-    """Every arm of `benchmarks.real_arms` diagnosed with the defaults, measured on a motion that it has not seen.
+def unseen(data: Path) -> Iterator[tuple[str, str, Diagnosis]]:
+    """Every arm of `benchmarks.real_arms` diagnosed with the defaults, measured on a motion that it has not seen: name
+    of the arm, of that motion, and the diagnosis, already printed.
 
     The LWR4+ has the stiffness and the gear ratios of its file, the others those of none.
     """
@@ -64,6 +65,7 @@ def unseen(data: Path) -> None:
                     for m in (found.base_model, found.extended_model)
                 )
                 print(f"  relative error over all joints below {band:g} Hz: {before:.2f} % -> {after:.2f} %")
+            yield arm.folder, test, found
 
 
 def tx40(folder: Path) -> None:

@@ -239,7 +239,12 @@ def main(arguments: Sequence[str]) -> int:
     if not wanted.diagnosis_only:
         for table in (held_out, per_joint, honesty, priors, tilts):
             table(data)
-    unseen(folder.parent)
+    for arm, test, found in unseen(folder.parent):
+        if arm == folder.name:
+            before, after = (
+                data.model_relative(m, int(test)) for m in (found.base_model, found.extended_model)
+            )
+            print(f"  on the samples of the tables above: {before:.2f} % -> {after:.2f} %")
     for name, case in (("tx40", tx40), ("iiwa14", iiwa14)):
         if (folder.parent / name).is_dir():
             case(folder.parent / name)
