@@ -190,21 +190,17 @@ class Dictionary:
 
     def rows(self, candidate: Candidate, shape: Shape) -> Rows:
         """Columns of a candidate in rows: (m, k) by side and joint."""
-        nominal, joint = self.nominal, max(candidate.joint, 0)
-        by_motion = [candidate.effect.columns(motion, joint, shape) for motion in nominal.motions]
+        effect, joint = candidate.effect, max(candidate.joint, 0)
+        reduced = self.nominal.columns(lambda motion: effect.columns(motion, joint, shape), effect.seen_by)
         found: dict[Key, Floats] = {}
-        for side in nominal.rows:
-            signals = [
-                [getattr(column, side) for column in columns] for columns in zip(*by_motion, strict=True)
-            ]
-            reduced = [nominal.reduce(side, signal) for signal in signals if signal[0] is not None]
-            if not reduced:
+        for side, columns in reduced.items():
+            if not columns:
                 continue
-            if reduced[0].ndim == 1:
-                found[side, candidate.joint] = np.stack(reduced, axis=1)
+            if columns[0].ndim == 1:
+                found[side, candidate.joint] = np.stack(columns, axis=1)
                 continue
-            for j in range(nominal.arm.chain.n):
-                column = np.stack([r[:, j] for r in reduced], axis=1)
+            for j in range(self.nominal.arm.chain.n):
+                column = np.stack([r[:, j] for r in columns], axis=1)
                 if np.any(column):
                     found[side, j] = column
         return found

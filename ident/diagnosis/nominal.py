@@ -11,12 +11,13 @@ follows from the predicted torque, so no sensor's noise or error leaks from one 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.sparse import csr_array
@@ -28,18 +29,20 @@ from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, Coupling, DriveMotion, ModelStructure, Side
-from ident.effects import effects_torque
+from ident.effects import Column, effects_torque
 from ident.effects.motion import ArmMotion, dahl, in_order
 from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.binned import Motion, binned_regressor, bins
 from ident.rows.filters import differentiate, low_pass
-from lwr_driver.session.spool import Arena
+from lwr_driver.session.spool import Arena, spans
 
 Floats = NDArray[np.float64]
 
 # Least share of a low-passed row from samples of a moving joint.
 _KNOWN = 0.8
+# Samples of a motion in work together, and least share in use for a slice of them.
+_TOGETHER, _DENSE = 2**14, 0.6
 # Length of the windows used of a long session [s].
 _WINDOW_S = 10.0
 # Compliance [rad/Nm] of a joint taken as rigid.
@@ -143,6 +146,9 @@ class Nominal:
     _operators: dict[tuple[str, int, float], tuple[csr_array, float]] = field(
         default_factory=dict, init=False, repr=False
     )
+    _pieces: dict[tuple[str | float, ...], list[list[_Piece]]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def __post_init__(self) -> None:
         self.motions = self.motions or in_order([self._motion(r, s, s.effort) for r, s in self.stretches])
@@ -181,6 +187,7 @@ class Nominal:
             link = self._link_torque(before.q, before.qd, before.qdd, body, drive)
             motions.append(self._motion(recording, stretch, link, body, drive))
         self.motions = in_order(motions)
+        self._pieces.clear()
         self._make_rows()
 
     def _link_torque(
@@ -295,6 +302,60 @@ class Nominal:
         whole = np.concatenate(parts)
         return whole[:, 0] if values[0].ndim == 1 else whole
 
+    def columns(
+        self, made: Callable[[ArmMotion], Sequence[Column]], sides: Sequence[str] | None = None
+    ) -> dict[str, list[Floats]]:
+        """Rows (m,) or (m, n) of columns by side, made from one part of the motions after the other.
+
+        made : the columns of a part, of the same shape in each. sides : to look at, default all. A column without
+        values on a side is left out there.
+        """
+        sides = tuple(side for side in self.sides if sides is None or side in sides)
+        key = (*sides, self.arm.motor_delay_s, self.arm.joint_delay_s)
+        if key not in self._pieces:
+            self._pieces[key] = [
+                list(self._cut(sides, number, *pair)) for number, pair in enumerate(self.stretches)
+            ]
+        found: dict[str, dict[int, list[Floats]]] = {side: {} for side in sides}
+        for number, (pieces, (recording, stretch)) in enumerate(
+            zip(self._pieces[key], self.stretches, strict=True)
+        ):
+            rows: dict[tuple[str, int], Floats] = {}
+            for piece in pieces:
+                for k, column in enumerate(made(piece.motion)):
+                    for side, gather in piece.gathers.items():
+                        values = column.motor if side == "motor" else column.joint
+                        if values is None:
+                            continue
+                        if (side, k) not in rows:
+                            count = self._operator(side, number, recording, stretch)[0].shape[0]
+                            rows[side, k] = np.zeros((count, *values.shape[1:]))
+                        gather.add(values, rows[side, k])
+            for (side, k), values in rows.items():
+                if self.band_hz[side] is not None:
+                    dt = self._operator(side, number, recording, stretch)[1]
+                    chosen = self._windows(recording, self._stamps(side, stretch))
+                    values = self._slow(side, values, dt)[chosen]
+                found[side].setdefault(k, []).append(values)
+        return {side: [np.concatenate(parts) for parts in of.values()] for side, of in found.items()}
+
+    def _cut(
+        self, sides: Sequence[str], number: int, recording: SessionRecord, stretch: RecordStretch
+    ) -> Iterator[_Piece]:
+        """Parts of a motion that fit into the processor's cache, with the samples in use alone."""
+        held = [side for side in sides if _holds(recording, stretch, side)]
+        operators = {side: self._operator(side, number, recording, stretch)[0].tocsc() for side in held}
+        used = np.zeros(len(stretch.time), dtype=bool)
+        for operator in operators.values():
+            used |= np.diff(operator.indptr) > 0
+        places = np.flatnonzero(used)
+        for some in spans(len(places), _TOGETHER):
+            here = places[some]
+            whole = slice(int(here[0]), int(here[-1]) + 1)
+            picked = whole if len(here) > _DENSE * (whole.stop - whole.start) else here
+            parts = {side: _gather(operator[:, picked]) for side, operator in operators.items()}
+            yield _Piece(self.motions[number].part(picked), parts)
+
     def _operator(
         self, side: str, number: int, recording: SessionRecord, stretch: RecordStretch
     ) -> tuple[csr_array, float]:
@@ -364,9 +425,17 @@ class Nominal:
         self.rows = {side: self._side_rows(side) for side in self.sides}
         for side in self.sides if self.arm.healthy else ():
             of: Side = "motor" if side == "motor" else "joint"
-            torques = [effects_torque(self.arm.healthy, m, side=of, measured=True) for m in self.motions]
-            rows = self.rows[side]
-            self.rows[side] = replace(rows, target=rows.target - self.reduce(side, torques))
+            rows, torque = self.rows[side], self._healthy_torque(of)
+            self.rows[side] = replace(rows, target=rows.target - torque)
+
+    def _healthy_torque(self, side: Side) -> Floats:
+        """Torque (m, n) [Nm] of the healthy arm's own effects."""
+
+        def made(motion: ArmMotion) -> tuple[Column, ...]:
+            torque = effects_torque(self.arm.healthy, motion, side=side, measured=True)
+            return (Column(motor=torque) if side == "motor" else Column(joint=torque),)
+
+        return self.columns(made, [side])[side][0]
 
     def _side_rows(self, side: str) -> SideRows:
         parts = []
@@ -442,6 +511,58 @@ class Nominal:
             chosen,
             width,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Gather:
+    """A part of an operator: rows from `first` on, made from samples of a part of a motion (CSR)."""
+
+    first: int
+    starts: NDArray[np.int32]
+    samples: NDArray[np.int32]
+    weights: Floats
+
+    def add(self, values: Floats, rows: Floats) -> None:
+        """Add what samples (N,) or (N, k) contribute to rows (m,) or (m, k)."""
+        here = rows[self.first : self.first + len(self.starts) - 1]
+        if values.ndim == 1:
+            _add_one(self.starts, self.samples, self.weights, values, here)
+        else:
+            _add_many(self.starts, self.samples, self.weights, values, here)
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """A part of a motion and its share of the rows of each side."""
+
+    motion: ArmMotion
+    gathers: dict[str, _Gather]
+
+
+def _gather(operator: Any) -> _Gather:
+    """The rows that are not empty of an operator (m, N), which are neighbours."""
+    matrix = csr_array(operator)
+    full = np.flatnonzero(np.diff(matrix.indptr))
+    first, last = (int(full[0]), int(full[-1]) + 1) if len(full) else (0, 0)
+    starts = matrix.indptr[first : last + 1].astype(np.int32)
+    return _Gather(first, starts, matrix.indices.astype(np.int32), matrix.data)
+
+
+@njit(cache=True, nogil=True)
+def _add_one(starts, samples, weights, values, rows):  # type: ignore[no-untyped-def]
+    for row in range(len(starts) - 1):
+        total = 0.0
+        for k in range(starts[row], starts[row + 1]):
+            total += weights[k] * values[samples[k]]
+        rows[row] += total
+
+
+@njit(cache=True, nogil=True)
+def _add_many(starts, samples, weights, values, rows):  # type: ignore[no-untyped-def]
+    for row in range(len(starts) - 1):
+        for k in range(starts[row], starts[row + 1]):
+            for column in range(values.shape[1]):
+                rows[row, column] += weights[k] * values[samples[k], column]
 
 
 def _holds(recording: SessionRecord, stretch: RecordStretch, side: str) -> bool:

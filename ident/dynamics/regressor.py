@@ -357,23 +357,53 @@ def mass_matrix(chain: Chain, q: ArrayLike, inertial: ArrayLike) -> Floats:
     zero = np.zeros_like(position)
     bodies = np.ascontiguousarray(inertial, dtype=np.float64)
     check_states(chain, position, zero, zero)
-    matrix = np.empty((len(position), chain.n, chain.n))
+    matrix, at = np.empty((len(position), chain.n, chain.n)), frames(chain, position)
     for j in range(chain.n):
         unit = zero.copy()
         unit[:, j] = 1.0
-        matrix[:, :, j] = _rnea(position, zero, unit, bodies, chain, np.zeros(3))
+        matrix[:, :, j] = _in_frames(at, zero, unit, bodies, chain, np.zeros(3))
     return matrix
 
 
 def _rnea(q: Floats, qd: Floats, qdd: Floats, bodies: Floats, chain: Chain, gravity: Floats) -> Floats:
-    cosine, sine = chain.cos_sin_alpha
+    return _in_frames(frames(chain, q), qd, qdd, bodies, chain, gravity)
+
+
+Frames = tuple[Floats, Floats, Floats]
+"""Cosine and sine of the joint angles, and offsets along the joint axes, (N, n) each."""
+
+
+def frames(chain: Chain, q: Floats) -> Frames:
+    """The joints' frames at positions q (N, n), to reuse in several torques."""
     angle = np.where(chain.prismatic, 0.0, q) + chain.theta
     offset = np.where(chain.prismatic, q, 0.0) + chain.r
-    out = np.empty(q.shape)
+    return np.cos(angle), np.sin(angle), offset
+
+
+def moved_frames(chain: Chain, at: Frames, q: Floats, joint: int) -> Frames:
+    """The same frames with one joint at q (N,)."""
+    cosine, sine, offset = at
+    if chain.prismatic[joint]:
+        offset = offset.copy()
+        offset[:, joint] = q + chain.r[joint]
+        return cosine, sine, offset
+    cosine, sine, angle = cosine.copy(), sine.copy(), q + chain.theta[joint]
+    cosine[:, joint], sine[:, joint] = np.cos(angle), np.sin(angle)
+    return cosine, sine, offset
+
+
+def torque_in(chain: Chain, at: Frames, qd: Floats, qdd: Floats, inertial: Floats) -> Floats:
+    """`torque` (N, n) in known frames, without checks."""
+    return _in_frames(at, qd, qdd, inertial, chain, chain.gravity)
+
+
+def _in_frames(at: Frames, qd: Floats, qdd: Floats, bodies: Floats, chain: Chain, gravity: Floats) -> Floats:
+    (cosine, sine), (ct, st, rr) = chain.cos_sin_alpha, at
+    out = np.empty(ct.shape)
     _newton_euler(
-        np.cos(angle),
-        np.sin(angle),
-        offset,
+        ct,
+        st,
+        rr,
         _fixed(qd),
         _fixed(qdd),
         cosine,
