@@ -34,15 +34,19 @@ from ident.effects.motion import ArmMotion, dahl, in_order
 from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.binned import Motion, binned_regressor, bins
-from ident.rows.filters import differentiate, low_pass
-from lwr_driver.session.spool import Arena, spans
+from ident.rows.filters import differentiate, low_pass, settling
+from lwr_driver.session.spool import Arena, column, spans, stored, stored_together
 
 Floats = NDArray[np.float64]
 
 # Least share of a low-passed row from samples of a moving joint.
 _KNOWN = 0.8
+# Samples of a block of a whole motion.
+_BLOCK = 2**16
 # Samples of a motion in work together, and least share in use for a slice of them.
 _TOGETHER, _DENSE = 2**14, 0.6
+# Samples without use between two parts of a motion.
+_GAP = 1000
 # Length of the windows used of a long session [s].
 _WINDOW_S = 10.0
 # Compliance [rad/Nm] of a joint taken as rigid.
@@ -92,9 +96,8 @@ class NominalArm:
         two of them (Maxwell slip: asperities of several lengths side by side)."""
         found = np.sign(speed)
         if self.presliding is not None:
-            path = np.cumsum(speed, axis=0) * dt
             for joint in np.flatnonzero(self.presliding > 0.0):
-                along = np.ascontiguousarray(path[:, joint])
+                along = np.cumsum(speed[:, joint]) * dt
                 start = float(found[0, joint])
                 found[:, joint] = dahl(along, float(self.presliding[joint]), start)
                 if self.far is not None and self.far_share is not None and self.far_share[joint] != 0.0:
@@ -184,7 +187,7 @@ class Nominal:
         motions = []
         for before, (recording, stretch) in zip(self.motions, self.stretches, strict=True):
             body = bodies[recording.payload]
-            link = self._link_torque(before.q, before.qd, before.qdd, body, drive)
+            link = self._link_torque_in_blocks(before, body, drive)
             motions.append(self._motion(recording, stretch, link, body, drive))
         self.motions = in_order(motions)
         self._pieces.clear()
@@ -196,6 +199,25 @@ class Nominal:
         """Torque (N, n) [Nm] through the joints."""
         rigid = regressor.torque(self.arm.chain, q, qd, qdd, bodies)
         return rigid + drive["Fvl"] * qd + drive["Fcl"] * np.sign(qd) + drive["offl"]
+
+    def _link_torque_in_blocks(
+        self, motion: ArmMotion, bodies: Floats, drive: Mapping[str, Floats]
+    ) -> Floats:
+        """The same along a motion, in a file for a long one."""
+        parts = (motion.part(some) for some in spans(len(motion.time), _BLOCK))
+        return stored(self._link_torque(one.q, one.qd, one.qdd, bodies, drive) for one in parts)
+
+    def _twist(
+        self, torque: Floats, dt: float, cutoff: float
+    ) -> Iterator[tuple[slice, Floats, Floats, Floats]]:
+        """Twist of the joints and its derivatives (m, n) in blocks, from a torque (N, n)."""
+        reach = int(np.ceil(settling(cutoff) / dt)) + 4
+        for some in spans(len(torque), _BLOCK):
+            low = max(some.start - reach, 0)
+            twist = low_pass(torque[low : some.stop + reach], dt, cutoff) * self.arm.compliance
+            first, second = differentiate(twist, dt)
+            own = slice(some.start - low, some.stop - low)
+            yield some, twist[own], first[own], second[own]
 
     def _hanging(
         self, motors: RecordStretch, q: Floats, qd: Floats, bodies: Floats, drive: Mapping[str, Floats]
@@ -226,18 +248,27 @@ class Nominal:
             # A measured torque is noisy, and its second derivative more so; a predicted one is not.
             wanted = self.settings.deflection_hz if bodies is not None else 20.0
             wanted = 10.0 if self.arm.encoder == "motor" else wanted
-            twist = low_pass(link_torque, dt, min(wanted, 0.2 / dt)) * self.arm.compliance
-            first, second = differentiate(twist, dt)
+            twisted = self._twist(link_torque, dt, min(wanted, 0.2 / dt))
             if self.arm.encoder == "link":
-                speed, acceleration = speed + first, acceleration + second
+                speed, acceleration = stored_together(
+                    (qd[some] + first, qdd[some] + second) for some, _, first, second in twisted
+                )
             else:
-                q, qd, qdd = q - twist, qd - first, qdd - second
+                q, qd, qdd = stored_together(
+                    (q[some] - twist, qd[some] - first, qdd[some] - second)
+                    for some, twist, first, second in twisted
+                )
+                speed, acceleration = stretch.qd, stretch.qdd
                 if bodies is not None and drive is not None:
                     q, qd, qdd, springs = self._hanging(stretch, q, qd, bodies, drive)
                     link_torque = self._link_torque(q, qd, qdd, bodies, drive)
         values = drive or dict.fromkeys(("Ia", "Fvm", "Fcm", "offm", "Fcl"), np.zeros(n))
-        slip = self.arm.slip(speed, dt)
-        friction = values["Fvm"] * speed + values["Fcm"] * slip
+        slip = stored([self.arm.slip(speed, dt)])
+
+        def driving(some: slice) -> Floats:
+            friction = values["Fvm"] * speed[some] + values["Fcm"] * slip[some]
+            return link_torque[some] + values["Ia"] * acceleration[some] + friction + values["offm"]
+
         return ArmMotion(
             chain=self.arm.chain,
             bodies=np.zeros((n, 10)) if bodies is None else bodies,
@@ -250,7 +281,7 @@ class Nominal:
             motor_speed=speed,
             motor_acceleration=acceleration,
             joint_torque=link_torque,
-            motor_torque=link_torque + values["Ia"] * acceleration + friction + values["offm"],
+            motor_torque=stored(driving(some) for some in spans(len(speed), _BLOCK)),
             gear_ratio=self.arm.gear_ratio,
             inertia=values["Ia"],
             link_coulomb=values["Fcl"],
@@ -322,9 +353,9 @@ class Nominal:
         ):
             rows: dict[tuple[str, int], Floats] = {}
             for piece in pieces:
-                for k, column in enumerate(made(piece.motion)):
+                for k, one in enumerate(made(piece.motion)):
                     for side, gather in piece.gathers.items():
-                        values = column.motor if side == "motor" else column.joint
+                        values = one.motor if side == "motor" else one.joint
                         if values is None:
                             continue
                         if (side, k) not in rows:
@@ -349,8 +380,9 @@ class Nominal:
         for operator in operators.values():
             used |= np.diff(operator.indptr) > 0
         places = np.flatnonzero(used)
-        for some in spans(len(places), _TOGETHER):
-            here = places[some]
+        gaps = np.flatnonzero(np.diff(places) > _GAP) + 1
+        runs = (run[some] for run in np.split(places, gaps) for some in spans(len(run), _TOGETHER))
+        for here in runs:
             whole = slice(int(here[0]), int(here[-1]) + 1)
             picked = whole if len(here) > _DENSE * (whole.stop - whole.start) else here
             parts = {side: _gather(operator[:, picked]) for side, operator in operators.items()}
@@ -448,9 +480,7 @@ class Nominal:
                 target, usable, speed = stretch.motor, stretch.motor_usable, motion.motor_speed
             else:
                 target, usable, speed = stretch.effort, stretch.usable, motion.qd
-            moves = (np.abs(_at(stretch.time, speed, at)) > self.settings.standstill_rad_s) & (
-                _at(stretch.time, self._steady(speed, stretch), at) > 0.999
-            )
+            moves = self._moves(stretch, speed, at)
             dt = width * usual_step(stamp)
             stamps = self._stamps(side, stretch)
             chosen = self._windows(recording, stamps)
@@ -481,12 +511,18 @@ class Nominal:
             Arena().keep(np.concatenate(matrices, axis=1)), *(np.concatenate(part) for part in others)
         )
 
-    def _steady(self, speed: Floats, stretch: RecordStretch) -> Floats:
-        """1 where a joint keeps its direction for a while before and after, 0 elsewhere, (N, n)."""
+    def _moves(self, stretch: RecordStretch, speed: Floats, at: Floats) -> NDArray[np.bool_]:
+        """Whether joints move in one direction for a while before and after times (m,), (m, n)."""
         dt = float(stretch.time[1] - stretch.time[0])
         size = 2 * round(self.settings.reversal_s / dt) + 1
-        same = (minimum_filter1d(speed, size, axis=0) > 0.0) | (maximum_filter1d(speed, size, axis=0) < 0.0)
-        return same.astype(float)
+        found = np.empty((len(at), speed.shape[1]), dtype=bool)
+        for joint in range(speed.shape[1]):
+            # One joint of a long session at a time.
+            own = column(speed, joint)
+            steady = (minimum_filter1d(own, size) > 0.0) | (maximum_filter1d(own, size) < 0.0)
+            moves = np.abs(_at(stretch.time, own[:, None], at)) > self.settings.standstill_rad_s
+            found[:, joint] = (moves & (_at(stretch.time, steady[:, None].astype(float), at) > 0.999))[:, 0]
+        return found
 
     def _matrix(
         self, side: str, motion: ArmMotion, recording: SessionRecord, grid: Floats, at: Floats, width: int
@@ -561,8 +597,8 @@ def _add_one(starts, samples, weights, values, rows):  # type: ignore[no-untyped
 def _add_many(starts, samples, weights, values, rows):  # type: ignore[no-untyped-def]
     for row in range(len(starts) - 1):
         for k in range(starts[row], starts[row + 1]):
-            for column in range(values.shape[1]):
-                rows[row, column] += weights[k] * values[samples[k], column]
+            for own in range(values.shape[1]):
+                rows[row, own] += weights[k] * values[samples[k], own]
 
 
 def _holds(recording: SessionRecord, stretch: RecordStretch, side: str) -> bool:

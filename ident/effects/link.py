@@ -27,10 +27,12 @@ from ident.effects.effect import (
 from ident.effects.motion import ArmMotion, Floats, dahl
 from ident.effects.springs import Springs
 from ident.effects.words import Values, one_joint, quantity, quantity_text, times, wave
-from ident.rows.filters import differentiate, low_pass
+from ident.rows.filters import differentiate, low_pass, settling
 
 # Cut-off of a twist before it is differentiated, with the link and with the motor displaced [Hz].
 _LINK_HZ, _MOTOR_HZ = 8.0, 30.0
+# Samples in reach of a derivative.
+_REACH = 4
 
 
 class _Encoder(Form):
@@ -124,7 +126,7 @@ class JointElasticity(_Twisting):
             size = shape.get("size", _SMALL)
             return _changed_springs(motion, motion.springs.softer(joint, size), size, ("softer", joint, size))
         at_motor = shape.form is _Encoder.MOTOR
-        return _deflected(motion, joint, lambda torque: torque, ("elastic",), at_motor, 1e-5)
+        return _deflected(motion, joint, lambda torque: torque, at_motor, 1e-5)
 
     def twist(self, torque: Any, parameters: Parameters) -> Any:
         """In proportion to the torque."""
@@ -189,7 +191,7 @@ class Backlash(_Twisting):
             return np.asarray(0.5 * np.tanh(torque / shape["width"]))
 
         at_motor = shape.form is _Encoder.MOTOR
-        return _deflected(motion, joint, half, ("backlash", shape["width"]), at_motor, 1e-3)
+        return _deflected(motion, joint, half, at_motor, 1e-3)
 
     def twist(self, torque: Any, parameters: Parameters) -> Any:
         """Half the gap to the side of the torque."""
@@ -200,7 +202,6 @@ def _deflected(
     motion: ArmMotion,
     joint: int,
     twist: Callable[[Floats], Floats],
-    key: tuple[Hashable, ...],
     encoder_at_motor: bool,
     scale: float,
 ) -> tuple[Column, ...]:
@@ -208,18 +209,18 @@ def _deflected(
 
     With the encoder at the motor the link stands at q - twist, and all torques change. With the encoder at the link
     the motor moves by the twist beside it: drive inertia and drive friction see its derivatives. twist : as a function
-    of the joint torque (N,), remembered by `key`. scale : coefficient of the linearisation. The links are taken to
+    of the joint torque (N,). scale : coefficient of the linearisation. The links are taken to
     follow at once.
     """
     # Two derivatives amplify the noisy acceleration part of the torque, with the link's inertia as a factor more than
     # with the drive's friction.
     cutoff = min(_LINK_HZ if encoder_at_motor else _MOTOR_HZ, 0.2 / motion.dt)
 
-    def turned(whole: ArmMotion) -> Floats:
-        smooth = low_pass(twist(whole.joint_torque[:, joint])[:, None], whole.dt, cutoff)
-        return np.hstack([smooth, *differentiate(smooth, whole.dt)])
+    def turned(around: ArmMotion) -> Floats:
+        smooth = low_pass(twist(around.joint_torque[:, joint])[:, None], around.dt, cutoff)
+        return np.hstack([smooth, *differentiate(smooth, around.dt)])
 
-    turn, first, second = motion.along(turned, *key, joint, cutoff).T
+    turn, first, second = motion.beside(settling(cutoff) + _REACH * motion.dt, turned).T
     if encoder_at_motor:
         return (both_sides(motion.displaced(joint, -scale * turn, -scale * first, -scale * second) / scale),)
     # Without the jump of Coulomb friction: it moves by a millisecond or so, and would give a column of spikes.

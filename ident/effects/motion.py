@@ -119,6 +119,16 @@ class ArmMotion:
         first, last = np.searchsorted(self.whole.time, self.time[[0, -1]])
         return self.whole.part(slice(max(int(first) - more, 0), int(last) + more + 1))
 
+    def beside(self, seconds: float, made: Callable[[ArmMotion], Floats]) -> Floats:
+        """Values (N, ...) of an operator that reaches `seconds` to either side, for a part made from its
+        surroundings."""
+        around = self.around(seconds)
+        values = made(around)
+        if around is self or not isinstance(around.picked, slice):
+            return values
+        first, own = around.picked.start, self.picked
+        return values[slice(own.start - first, own.stop - first) if isinstance(own, slice) else own - first]
+
     @cached_property
     def _kept(self) -> dict[tuple[Hashable, ...], Floats]:
         return {}

@@ -157,6 +157,16 @@ def stored(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
     return rows.array()
 
 
+def stored_together(groups: Iterable[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
+    """`stored` for several arrays whose parts are made together: the first parts, the second ones, and so on."""
+    rows: list[Growing] = []
+    for group in groups:
+        rows = rows or [Growing() for _ in group]
+        for growing, part in zip(rows, group, strict=True):
+            growing.append(part)
+    return [growing.array() for growing in rows]
+
+
 def _watched(held: mmap.mmap | None) -> None:
     """Bound the memory of all open files: a thread gives pages back, whoever reads them comes by them again."""
     global _watch
