@@ -31,7 +31,8 @@ _ARENA_BYTES = 2**22, 2**28
 """First and largest file of an arena; each has twice the size of the one before."""
 _MOST_BYTES = 64 * 2**20
 _EVERY_S = 0.01
-_M_MMAP_THRESHOLD = -3
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_KEPT_BYTES = 32 * 2**20
 _page = mmap.PAGESIZE
 _open: weakref.WeakSet[Any] = weakref.WeakSet()
 _watch: threading.Thread | None = None
@@ -190,6 +191,8 @@ def _prepare_process() -> None:
     with contextlib.suppress(OSError, AttributeError):
         library = ctypes.CDLL(None)
         library.mallopt(_M_MMAP_THRESHOLD, 4 * 2**20)
+        # A part of the heap stays: to return and fetch it again with every array costs more than it is worth.
+        library.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
         library.malloc_trim(0)
 
 
