@@ -502,10 +502,9 @@ class Evidence:
         independent rows."""
         fit = fit or self.full
         scores = self.target - self.gram @ fit.values
-        middle = self.blocks / max(self.blocks - 1, 1) * scores.T @ scores
-        sandwich = fit.inverse @ middle @ fit.inverse
-        # The variance of columns without excitation is zero, on either side of it by rounding.
-        np.fill_diagonal(sandwich, np.maximum(np.diag(sandwich), 0.0))
+        # A product with its own transpose keeps every variance above zero by rounding, and every correlation below one.
+        moved = np.sqrt(self.blocks / max(self.blocks - 1, 1)) * scores @ fit.inverse
+        sandwich = moved.T @ moved
         return _widened(sandwich, fit.inverse)
 
     def free(self) -> tuple[Floats, Floats]:

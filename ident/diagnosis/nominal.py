@@ -366,7 +366,8 @@ class Nominal:
                 if self.band_hz[side] is not None:
                     dt = self._operator(side, number, recording, stretch)[1]
                     chosen = self._windows(recording, self._stamps(side, stretch))
-                    values = self._slow(side, values, dt)[chosen]
+                    wide = self._slow(side, values.reshape(len(values), -1), dt)[chosen]
+                    values = wide.reshape(len(wide), *values.shape[1:])
                 found[side].setdefault(k, []).append(values)
         return {side: [np.concatenate(parts) for parts in of.values()] for side, of in found.items()}
 

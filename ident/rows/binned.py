@@ -89,13 +89,14 @@ def binned_regressor(
     return found
 
 
-@njit(cache=True, nogil=True)
+# The order of a sum is free, so that the compiler may vectorise it.
+@njit(cache=True, nogil=True, fastmath={"reassoc"})
 def _add_means(table, width, out):  # type: ignore[no-untyped-def]
     """Add means over `width` samples of (C, n, N) to (n, >= N / width, C)."""
     columns, joints, samples = table.shape
     share = 1.0 / width
-    for c in range(columns):
-        for j in range(joints):
+    for j in range(joints):
+        for c in range(columns):
             series = table[c, j]
             for row in range(samples // width):
                 total = 0.0
