@@ -66,3 +66,30 @@ def test_remembered_products_are_those_of_the_present_columns(
         assert again.base.shape[2] == evidence.base_count + sum(
             next(iter(r.values())).shape[1] for r in extra
         )
+
+
+def test_columns_by_parts_are_those_of_whole_motions(make: Callable[..., Session], chain: Chain) -> None:
+    bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
+    nominal, setting = bench.nominal, bench.dictionary.setting
+    for cause in ("presliding_hysteresis", "friction_temperature", "joint_zero_offset", "joint_torque_delay"):
+        effect = EFFECTS[cause]
+        for shape in effect.shapes(setting, 1):
+            whole = [effect.columns(motion, 1, shape) for motion in nominal.motions]
+            parts = nominal.columns(lambda m, e=effect, s=shape: e.columns(m, 1, s))
+            for k, columns in enumerate(zip(*whole, strict=True)):
+                for side in nominal.rows:
+                    signals = [getattr(column, side) for column in columns]
+                    if signals[0] is not None:
+                        expected = nominal.reduce(side, signals)
+                        scale = np.abs(expected).max()
+                        np.testing.assert_allclose(parts[side][k], expected, rtol=1e-9, atol=1e-9 * scale)
+
+
+def test_a_dictionary_of_fewer_causes_keeps_its_columns(make: Callable[..., Session], chain: Chain) -> None:
+    bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
+    more = bench.dictionary.of(["sensor_gain", "cable_spring"])
+    before = [t for t in more.trials() if t.candidate.cause == "sensor_gain"]
+    after = list(more.of(["sensor_gain"]).trials())
+    assert before
+    assert [t.score.gain for t in after] == [t.score.gain for t in before]
+    assert all(a.rows is b.rows for a, b in zip(after, before, strict=True))
