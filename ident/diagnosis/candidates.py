@@ -188,7 +188,7 @@ class Dictionary:
         self._kept: dict[tuple[str, int], list[_Entry]] = {}
         self._arena = Arena()
 
-    def of(self, causes: Sequence[str]) -> Dictionary:
+    def of(self, causes: Sequence[str] | None) -> Dictionary:
         """The same with fewer causes, and the columns made so far."""
         found = Dictionary(self.nominal, self.evidence, causes)
         found._kept, found._arena = self._kept, self._arena
@@ -383,8 +383,18 @@ class Dictionary:
         return found
 
     def trials(self) -> Iterator[Trial]:
-        """The best shape of every candidate."""
-        return (trial for candidate in self.candidates if (trial := self.best(candidate)) is not None)
+        """The best shape of every candidate, in their order for any number of threads."""
+        jobs = self.evidence.settings.jobs
+        if jobs == 1:
+            found = map(self.best, self.candidates)
+        else:
+            from joblib import Parallel, delayed
+
+            # The same memory for all; numpy and the compiled loops let other threads run.
+            found = Parallel(n_jobs=jobs, require="sharedmem", return_as="generator")(
+                delayed(self.best)(candidate) for candidate in self.candidates
+            )
+        return (trial for trial in found if trial is not None)
 
 
 def _acts(rows: Rows) -> bool:

@@ -149,7 +149,7 @@ class Nominal:
     _operators: dict[tuple[str, int, float], tuple[csr_array, float]] = field(
         default_factory=dict, init=False, repr=False
     )
-    _pieces: dict[tuple[str | float, ...], list[list[_Piece]]] = field(
+    _pieces: dict[tuple[object, ...], list[list[_Piece]]] = field(
         default_factory=dict, init=False, repr=False
     )
 

@@ -106,8 +106,9 @@ class ArmMotion:
         found = self._kept.get(key)
         if found is None:
             found = made(self)
-            while len(self._kept) >= _KEPT:
-                self._kept.pop(next(iter(self._kept)), None)
+            # Threads may forget what another one has just made: it is made again, nothing else.
+            for old in list(self._kept)[: len(self._kept) + 1 - _KEPT]:
+                self._kept.pop(old, None)
             self._kept[key] = found
         return found
 

@@ -90,25 +90,27 @@ class Arena:
     def __init__(self) -> None:
         self._held: mmap.mmap | None = None
         self._used, self._next = 0, _ARENA_BYTES[0]
+        self._lock = threading.Lock()
 
     def keep(self, array: NDArray[Any]) -> NDArray[Any]:
         """The same array in a file; a small one as it is."""
         if array.nbytes < _SMALL_BYTES:
             return array
-        if self._held is None or self._used + array.nbytes > len(self._held):
-            size = max(self._next, array.nbytes)
-            try:
-                with tempfile.TemporaryFile(prefix="lwr-") as file:
-                    os.posix_fallocate(file.fileno(), 0, size)
-                    self._held, self._used = mmap.mmap(file.fileno(), size), 0
-            except OSError:
-                # No room in the temporary folder: memory has to do.
-                return array
-            self._next = min(2 * size, _ARENA_BYTES[1])
-            _watched(self._held)
-        kept = np.ndarray(array.shape, array.dtype, self._held, self._used)
+        with self._lock:
+            if self._held is None or self._used + array.nbytes > len(self._held):
+                size = max(self._next, array.nbytes)
+                try:
+                    with tempfile.TemporaryFile(prefix="lwr-") as file:
+                        os.posix_fallocate(file.fileno(), 0, size)
+                        self._held, self._used = mmap.mmap(file.fileno(), size), 0
+                except OSError:
+                    # No room in the temporary folder: memory has to do.
+                    return array
+                self._next = min(2 * size, _ARENA_BYTES[1])
+                _watched(self._held)
+            kept = np.ndarray(array.shape, array.dtype, self._held, self._used)
+            self._used += -(-array.nbytes // 64) * 64
         kept[...] = array
-        self._used += -(-array.nbytes // 64) * 64
         return kept
 
 
