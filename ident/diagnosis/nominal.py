@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -471,7 +471,8 @@ class Nominal:
         return self.columns(made, [side])[side][0]
 
     def _side_rows(self, side: str) -> SideRows:
-        parts = []
+        parts: list[tuple[Any, ...]] = []
+        matrices: list[Callable[[], Floats]] = []
         for motion, (recording, stretch) in zip(self.motions, self.stretches, strict=True):
             if not _holds(recording, stretch, side):
                 continue
@@ -485,32 +486,47 @@ class Nominal:
             dt = width * usual_step(stamp)
             stamps = self._stamps(side, stretch)
             chosen = self._windows(recording, stamps)
-            if self.band_hz[side] is None:
-                # The rows in use alone.
-                used = at[: len(at) // width * width].reshape(-1, width)[chosen].reshape(-1)
-                matrix = self._matrix(side, motion, recording, stretch.time, used, width)
-            else:
-                wide = self._matrix(side, motion, recording, stretch.time, at, width)
-                matrix = np.stack([self._slow(side, table, dt) for table in wide])[:, chosen]
+            matrices.append(partial(self._used_matrix, side, motion, recording, stretch, chosen))
             torque = self._slow(side, bins(target, width), dt)
             if self.band_hz[side] is not None:
                 # The columns pass through the same low-pass, so rounded reversals cancel; only longer rests are
                 # unknown.
                 valid = self._slow(side, bins((usable & moves).astype(float), width), dt) > _KNOWN
             else:
-                moves = bins(moves.astype(float), width) > 1.0 - 1e-9
+                moves = _whole(moves, width)
                 if side == "joint":
                     # The positions' low-pass rounds the corner made by the link's Coulomb friction.
                     span = max(at[-1] - at[0], 1e-9)
                     moves = _guarded(moves, round(self.settings.guard_s * len(moves) / span))
-                valid = (bins(usable.astype(float), width) > 1.0 - 1e-9) & moves
+                valid = _whole(usable, width) & moves
             session, test = (np.full(int(chosen.sum()), v) for v in (recording.number, recording.test))
-            usual = torque[chosen], (valid & self.moving)[chosen], session, stamps[chosen], test
-            parts.append((matrix, *usual))
-        matrices, *others = zip(*parts, strict=True)
-        return SideRows(
-            Arena().keep(np.concatenate(matrices, axis=1)), *(np.concatenate(part) for part in others)
-        )
+            parts.append((torque[chosen], (valid & self.moving)[chosen], session, stamps[chosen], test))
+        others = [np.concatenate(part) for part in zip(*parts, strict=True)]
+        # One stretch in memory at a time.
+        matrix = Arena().keep(np.empty((self.arm.chain.n, len(others[0]), len(self.base))))
+        first = 0
+        for (torque, *_), make in zip(parts, matrices, strict=True):
+            matrix[:, first : first + len(torque)] = make()
+            first += len(torque)
+        return SideRows(matrix, *others)
+
+    def _used_matrix(
+        self,
+        side: str,
+        motion: ArmMotion,
+        recording: SessionRecord,
+        stretch: RecordStretch,
+        chosen: NDArray[np.bool_],
+    ) -> Floats:
+        """(n, m, p) regressor of the `chosen` rows of one stretch and side."""
+        stamp, delay, width = self._sampling(side, stretch)
+        at = stamp - delay
+        if self.band_hz[side] is None:
+            # The rows in use alone.
+            used = at[: len(at) // width * width].reshape(-1, width)[chosen].reshape(-1)
+            return self._matrix(side, motion, recording, stretch.time, used, width)
+        wide = self._matrix(side, motion, recording, stretch.time, at, width)
+        return np.stack([self._slow(side, table, width * usual_step(stamp)) for table in wide])[:, chosen]
 
     def _moves(self, stretch: RecordStretch, speed: Floats, at: Floats) -> NDArray[np.bool_]:
         """Whether joints move in one direction for a while before and after times (m,), (m, n)."""
@@ -604,6 +620,12 @@ def _add_many(starts, samples, weights, values, rows):  # type: ignore[no-untype
 
 def _holds(recording: SessionRecord, stretch: RecordStretch, side: str) -> bool:
     return side in recording.sides and (side == "joint" or len(stretch.motor_time) > 1)
+
+
+def _whole(flags: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
+    """Whether all `width` samples of a bin are set, (m, n) of (N, n)."""
+    count = len(flags) // width
+    return np.asarray(flags[: count * width].reshape(count, width, -1).all(axis=1))
 
 
 def _guarded(moves: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:
