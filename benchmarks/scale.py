@@ -2,7 +2,8 @@
 
 Run `python -m benchmarks.scale LOGS [--minutes 1 10 60] [--commands identify validate ...]`. LOGS is the folder of an
 experiment with the emulator; the periods of its `unloaded.mcap` and `loaded.mcap` are repeated to the wanted length,
-with fresh noise of the sensors. Peak memory is the kernel's figure for the command's process (`wait4`).
+with fresh noise of the sensors. `--recorded` diagnoses its sessions as they are, too. Peak memory is the kernel's
+figure for the command's process (`wait4`).
 """
 
 from __future__ import annotations
@@ -86,6 +87,13 @@ def command_of(name: str, folder: Path) -> list[str]:
     }[name]
 
 
+def recorded(folder: Path, out: Path) -> list[str]:
+    """Arguments of a diagnosis of an experiment's sessions as they are, its validation session held out."""
+    logs = [str(folder / f"{session}.mcap") for session in NAMES]
+    held = str(folder / "validation.mcap")
+    return ["diagnose", *logs, "--test", held, "--out", str(out / f"diagnosis-{time.time_ns()}")]
+
+
 def measure(arguments: Sequence[str], log: Path) -> tuple[int, float, float, float]:
     """Exit code, wall time [s], CPU time [s] and peak memory [MB] of a command in a process of its own."""
     start = time.monotonic()
@@ -110,7 +118,12 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--minutes", type=float, nargs="+", default=[1.0, 10.0, 60.0])
     parser.add_argument("--commands", nargs="+", default=["identify", "validate", "diagnose"])
     parser.add_argument("--folder", type=Path, default=Path("scale"), help="for the tiled sessions; kept")
+    parser.add_argument("--recorded", action="store_true", help="diagnose the experiment's own sessions first")
     chosen = parser.parse_args(arguments)
+    if chosen.recorded:
+        chosen.folder.mkdir(parents=True, exist_ok=True)
+        code, wall, cpu, peak = measure(recorded(chosen.logs, chosen.folder), chosen.folder / "recorded.txt")
+        print(f"diagnose   as recorded: CPU {cpu:6.1f} s, wall {wall:6.1f} s, peak {peak:6.0f} MB, exit {code}")
     for minutes in chosen.minutes:
         folder = chosen.folder / f"{minutes:g}min"
         folder.mkdir(parents=True, exist_ok=True)

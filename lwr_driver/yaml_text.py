@@ -32,8 +32,8 @@ else:
                 base.__init__(self)
 
 
-class Dumper(yaml.SafeDumper):
-    """SafeDumper that quotes every text `Loader` would read as a number."""
+class Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+    """Safe dumper, by libyaml where PyYAML has it, that quotes every text `Loader` would read as a number."""
 
 
 for _kind in (Loader, Dumper):

@@ -52,6 +52,8 @@ _BIN = 20
 _BEGIN = 500
 _POSES = 100
 _PATH_HZ, _TWIST_HZ = 20.0, 12.0
+# Measured positions in use before and after a simulated part.
+_AROUND_NS = 5_000_000_000
 _LED_HZ, _HELD_HZ = 20.0, 3.0
 # Speed below which a drive may stick [rad/s], and time around it [s]: positions then tell nothing of the friction.
 _SLOW, _AROUND_S = 0.01, 0.05
@@ -381,6 +383,8 @@ def attached_experiment(session: Session) -> Experiment | None:
 
 def _smooth(times: NDArray[np.int64], position: Floats, grid: NDArray[np.int64]) -> Floats:
     """Measured positions as a smooth path (N, n)."""
+    first, last = np.searchsorted(times, grid[[0, -1]] + np.array([-_AROUND_NS, _AROUND_NS]))
+    times, position = times[first:last], position[first:last]
     here = (times - times[0]) * 1e-9
     step = float(np.median(np.diff(here)))
     even = np.arange(0.0, here[-1], step)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise, product
 
 import numpy as np
-from scipy.optimize import minimize, minimize_scalar
 
 from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
 from ident.diagnosis.nominal import Nominal
@@ -158,7 +158,7 @@ class _Span:
         return float(np.clip(np.log(here) if self.logarithmic else here, self.low, self.high))
 
 
-_Entry = tuple[Shape, Rows, dict[Key, Floats], Products]
+_Entry = tuple[Shape, Rows, Products]
 
 
 class Dictionary:
@@ -188,35 +188,34 @@ class Dictionary:
         self._kept: dict[tuple[str, int], list[_Entry]] = {}
         self._arena = Arena()
 
+    def of(self, causes: Sequence[str] | None) -> Dictionary:
+        """The same with fewer causes, and the columns made so far."""
+        found = Dictionary(self.nominal, self.evidence, causes)
+        found._kept, found._arena = self._kept, self._arena
+        return found
+
     def rows(self, candidate: Candidate, shape: Shape) -> Rows:
         """Columns of a candidate in rows: (m, k) by side and joint."""
-        nominal, joint = self.nominal, max(candidate.joint, 0)
-        by_motion = [candidate.effect.columns(motion, joint, shape) for motion in nominal.motions]
+        effect, joint = candidate.effect, max(candidate.joint, 0)
+        reduced = self.nominal.columns(lambda motion: effect.columns(motion, joint, shape), effect.seen_by)
         found: dict[Key, Floats] = {}
-        for side in nominal.rows:
-            signals = [
-                [getattr(column, side) for column in columns] for columns in zip(*by_motion, strict=True)
-            ]
-            reduced = [nominal.reduce(side, signal) for signal in signals if signal[0] is not None]
-            if not reduced:
+        for side, columns in reduced.items():
+            if not columns:
                 continue
-            if reduced[0].ndim == 1:
-                found[side, candidate.joint] = np.stack(reduced, axis=1)
+            if columns[0].ndim == 1:
+                found[side, candidate.joint] = np.stack(columns, axis=1)
                 continue
-            for j in range(nominal.arm.chain.n):
-                column = np.stack([r[:, j] for r in reduced], axis=1)
+            for j in range(self.nominal.arm.chain.n):
+                column = np.stack([r[:, j] for r in columns], axis=1)
                 if np.any(column):
                     found[side, j] = column
         return found
 
     def _entry(self, shape: Shape, rows: Rows) -> _Entry:
-        padded = self.evidence.padded(rows)
-        products = self.evidence.alone(padded)
+        products = self.evidence.alone(self.evidence.padded(rows))
         # All candidates together exceed the memory.
-        rows, padded = (
-            {key: self._arena.keep(values) for key, values in columns.items()} for columns in (rows, padded)
-        )
-        return shape, rows, padded, replace(products, alone=self._arena.keep(products.alone))
+        kept = {key: self._arena.keep(values) for key, values in rows.items()}
+        return shape, kept, replace(products, alone=self._arena.keep(products.alone))
 
     def _prepared(self, candidate: Candidate) -> list[_Entry]:
         if candidate.key not in self._kept:
@@ -238,14 +237,14 @@ class Dictionary:
             key = (candidate.cause, -2 - number)
             if key not in self._kept:
                 self._kept[key] = [self._entry(shape, self.rows(candidate, shape))]
-            _, _, padded, known = self._kept[key][0]
-            whole = evidence.products(padded, known)
+            _, rows, known = self._kept[key][0]
+            whole = evidence.products(partial(evidence.padded, rows), known)
             for edge in np.sort(starts)[1:]:
                 if not _STEP_ROOM_S <= edge <= self.setting.durations_s[session] - _STEP_ROOM_S:
                     continue
                 on = (evidence.block_session > session).astype(float)
                 on[mine[starts >= edge]] = 1.0
-                score = evidence.score_products(whole.only(on), list(padded))
+                score = evidence.score_products(whole.only(on), list(rows))
                 score = evidence.event_score(score, evidence.blocks)
                 if best is None or score.gain > best[1].gain:
                     best = (shape.at(time=edge), score, key)
@@ -299,37 +298,39 @@ class Dictionary:
             return self._step(candidate)
         best: Trial | None = None
         entries = self._prepared(candidate)
-        for shape, rows, padded, known in entries:
-            score = self.measure(candidate, padded, len(entries), known)
+        for shape, rows, known in entries:
+            score = self.measure(candidate, rows, len(entries), known)
             better = best is None or _worth(score) > _worth(best.score)
             if better and candidate.effect.plausible(score.coefficients, shape):
                 best = Trial(candidate, shape, score, rows)
         return best
 
     def measure(
-        self,
-        candidate: Candidate,
-        padded: Mapping[Key, Floats],
-        choices: int = 1,
-        known: Products | None = None,
+        self, candidate: Candidate, rows: Rows, choices: int = 1, known: Products | None = None
     ) -> Score:
-        """Score of padded columns by the rules of the candidate's effect."""
-        pull = _ABOUT_ONE**-2.0 if candidate.effect.hidden else 0.0
-        score = self.evidence.score(padded, known=known, pull=pull)
-        return self.evidence.event_score(score, choices) if candidate.effect.event else score
+        """Score of rows by the rules of the candidate's effect; `known` : their products with the base alone."""
+        evidence, pull = self.evidence, _ABOUT_ONE**-2.0 if candidate.effect.hidden else 0.0
+        if known is None:
+            score = evidence.score(evidence.padded(rows), pull=pull)
+        else:
+            score = evidence.score_rows(rows, known, pull=pull)
+        return evidence.event_score(score, choices) if candidate.effect.event else score
 
     def trial(self, candidate: Candidate, shape: Shape, choices: int = 1) -> Trial | None:
         """The candidate with a given shape, None without rows or with implausible coefficients."""
         rows = self.rows(candidate, shape)
         if not _acts(rows):
             return None
-        score = self.measure(candidate, self.evidence.padded(rows), choices)
+        score = self.measure(candidate, rows, choices)
         plausible = candidate.effect.plausible(score.coefficients, shape)
         return Trial(candidate, shape, score, rows) if plausible else None
 
     def refine(self, trial: Trial, choices: int = 1, evaluations: int = 12) -> Trial:
         """The trial with its continuous shape parameters at the best fit: one after the other, then together, since a
         speed and an exponent compensate each other along a narrow valley."""
+        # A fifth of a short diagnosis' imports, and seldom needed.
+        from scipy.optimize import minimize, minimize_scalar
+
         best = trial
 
         def loss(spans: Sequence[_Span], point: Sequence[float]) -> float:
@@ -382,8 +383,18 @@ class Dictionary:
         return found
 
     def trials(self) -> Iterator[Trial]:
-        """The best shape of every candidate."""
-        return (trial for candidate in self.candidates if (trial := self.best(candidate)) is not None)
+        """The best shape of every candidate, in their order for any number of threads."""
+        jobs = self.evidence.settings.jobs
+        if jobs == 1:
+            found = map(self.best, self.candidates)
+        else:
+            from joblib import Parallel, delayed
+
+            # The same memory for all; numpy and the compiled loops let other threads run.
+            found = Parallel(n_jobs=jobs, require="sharedmem", return_as="generator")(
+                delayed(self.best)(candidate) for candidate in self.candidates
+            )
+        return (trial for trial in found if trial is not None)
 
 
 def _acts(rows: Rows) -> bool:

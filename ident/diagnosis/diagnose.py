@@ -24,7 +24,7 @@ from ident.diagnosis.broken_data import (
     without_broken,
     worthless,
 )
-from ident.diagnosis.candidates import Candidate, Dictionary
+from ident.diagnosis.candidates import Candidate
 from ident.diagnosis.conclusion import conclude
 from ident.diagnosis.confirmation import confirmed_delay
 from ident.diagnosis.evidence import Score
@@ -134,7 +134,7 @@ def _in_time(task: Task, state: State) -> State:
     ]
     if doubtful:
         task = replace(task, causes=[cause for cause in task.causes or EFFECTS if cause not in doubtful])
-        state.bench.dictionary = Dictionary(state.bench.nominal, state.bench.evidence, task.causes)
+        state.bench.dictionary = state.bench.dictionary.of(task.causes)
         state = State(state.bench, task.select(state.bench))
         late = _late(state.selection)
     if not late:

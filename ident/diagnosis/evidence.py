@@ -11,8 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import pairwise
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from fri.errors import DataError
@@ -34,6 +36,7 @@ Key = tuple[str, int]
 Rows = Mapping[Key, Floats]
 """Columns in rows: (m, k) for each side and joint with non-zero entries."""
 _Sums = tuple[Floats, Floats, Floats]
+_Columns = Mapping[Key, Floats] | Callable[[], Mapping[Key, Floats]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,9 +162,9 @@ class Evidence:
                 self._weights[key] = 1.0 / (self.sigma[side][j] ** 2 * self.variance_inflation[side][j])
                 # Most base columns do not act on most joints.
                 self._acting[key] = np.flatnonzero(np.any(wide != 0.0, axis=0))
-                self._columns[key] = self._arena.keep(self._padded(side, wide[:, self._acting[key]]))
-                self._targets[key] = self._padded(side, np.where(keep, rows.target[:, j], 0.0)[:, None])
-                self.mask[key] = self._padded(side, keep.astype(float)[:, None])
+                self._columns[key] = self._arena.keep(wide[self._order[side]][:, self._acting[key]])
+                self._targets[key] = np.where(keep, rows.target[:, j], 0.0)[self._order[side], None]
+                self.mask[key] = keep[self._order[side], None].astype(float)
                 self._independent[key] = float(keep.sum()) / float(self.variance_inflation[side][j])
         self.base_count = len(nominal.base)
         self.extra: list[Rows] = []
@@ -177,7 +180,6 @@ class Evidence:
         settings = self.settings
         numbers: dict[tuple[int, int], int] = {}
         folds: list[int] = []
-        self._place: dict[str, tuple[NDArray[np.int64], NDArray[np.int64], int]] = {}
         start = {r.number: r.start_s for r in nominal.recordings}
         period = {r.number: r.period_s for r in nominal.recordings}
         # A motion without repetition gives half as long a block, for enough of them.
@@ -186,14 +188,21 @@ class Evidence:
         ids: dict[str, NDArray[np.int64]] = {}
         for side, rows in nominal.rows.items():
             found = np.full(len(rows.time), -1)
-            for k in np.flatnonzero(~rows.test):
-                session = int(rows.session[k])
-                since = rows.time[k] - start[session]
-                block = (session, int(since / length[session]))
-                if block not in numbers:
-                    numbers[block] = len(numbers)
-                    folds.append(int(since % period[session] / length[session]) % settings.folds)
-                found[k] = numbers[block]
+            for session in np.unique(rows.session[~rows.test]).tolist():
+                mine = np.flatnonzero(~rows.test & (rows.session == session))
+                since = rows.time[mine] - start[session]
+                within = (since / length[session]).astype(np.int64)
+                blocks, first, place = np.unique(within, return_index=True, return_inverse=True)
+                known = np.empty(len(blocks), dtype=np.int64)
+                # In the order of time, as they are met.
+                for k in np.argsort(first, kind="stable"):
+                    block = (session, int(blocks[k]))
+                    if block not in numbers:
+                        numbers[block] = len(numbers)
+                        phase = since[first[k]] % period[session]
+                        folds.append(int(phase / length[session]) % settings.folds)
+                    known[k] = numbers[block]
+                found[mine] = known[place]
             ids[side] = found
         self.blocks = len(numbers)
         self.block_session = np.array([session for session, _ in numbers], dtype=np.int64)
@@ -202,21 +211,16 @@ class Evidence:
         self.parts = (np.unique(self.fold)[:, None] == self.fold).astype(float)
         if len(set(folds)) < 2:
             raise DataError("the sessions are too short to hold a part of them back; record at least 5 s")
+        self._block = ids
+        self._order: dict[str, slice | NDArray[np.int64]] = {}
+        self._starts: dict[str, NDArray[np.int64]] = {}
         for side, found in ids.items():
             fitted = np.flatnonzero(found >= 0)
             order = fitted[np.argsort(found[fitted], kind="stable")]
+            even = len(order) > 0 and bool(np.all(np.diff(order) == 1))
+            self._order[side] = slice(int(order[0]), int(order[-1]) + 1) if even else order
             counts = np.bincount(found[fitted], minlength=self.blocks)
-            within = np.zeros(len(found), dtype=np.int64)
-            within[order] = np.concatenate([np.arange(c) for c in counts])
-            self._place[side] = (found, within, int(counts.max(initial=1)))
-
-    def _padded(self, side: str, values: Floats) -> Floats:
-        """(blocks, L, k) of rows (m, k); zeros where a block is shorter. Held-out rows have none."""
-        block, within, length = self._place[side]
-        fitted = block >= 0
-        out = np.zeros((self.blocks, length, values.shape[1]))
-        out[block[fitted], within[fitted]] = values[fitted]
-        return out
+            self._starts[side] = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
     # ---- products ----
 
@@ -227,11 +231,12 @@ class Evidence:
         self.energy = np.zeros(self.blocks)
         for key, matrix in self._columns.items():
             weight, t = self._weights[key], self._targets[key]
-            turned = weight * matrix.transpose(0, 2, 1)
-            on = self._acting[key]
-            self._base_gram[:, on[:, None], on] += np.matmul(turned, matrix)
-            self._base_target[:, on] += np.matmul(turned, t)[:, :, 0]
-            self.energy += weight * np.sum(t[:, :, 0] ** 2, axis=1)
+            on, starts = self._acting[key], self._starts[key[0]]
+            for block, (first, last) in enumerate(pairwise(starts.tolist())):
+                own, torque = matrix[first:last], t[first:last, 0]
+                self._base_gram[block, on[:, None], on] += weight * (own.T @ own)
+                self._base_target[block, on] += weight * (own.T @ torque)
+                self.energy[block] += weight * float(torque @ torque)
 
     def _places(self) -> Iterator[tuple[slice, Rows]]:
         """The further columns with their places behind the base."""
@@ -287,18 +292,18 @@ class Evidence:
         return Fit(inverse @ target, inverse)
 
     def padded(self, rows: Rows) -> dict[Key, Floats]:
-        """Columns in blocks, zero in unused rows."""
-        return {key: self._padded(key[0], values) * self.mask[key] for key, values in rows.items()}
+        """Columns (r, k) in the order of the blocks, zero in unused rows."""
+        return {key: values[self._order[key[0]]] * self.mask[key] for key, values in rows.items()}
 
-    def products(self, columns: Mapping[Key, Floats], known: Products | None = None) -> Products:
-        """Products in each block of padded columns (blocks, L, k); `known` : those with the base alone, which remember
-        the ones with further columns."""
-        known = self.alone(columns) if known is None else known
+    def products(self, columns: _Columns, known: Products | None = None) -> Products:
+        """Products in each block of padded columns (r, k), or of those that a function makes on demand; `known` : those
+        with the base alone, which remember the ones with further columns."""
+        known = self.alone(_made(columns)) if known is None else known
         if not self.extra:
             return known
         missing = [rows for rows in self.extra if id(rows) not in known.crossed]
         if missing:
-            sums, place = _sums(self.parts, self._cross(columns, self._together(missing))), 0
+            sums, place = _sums(self.parts, self._cross(_made(columns), self._together(missing))), 0
             for rows in missing:
                 known.crossed[id(rows)] = sums[:, :, place : place + _width(rows)]
                 place += _width(rows)
@@ -306,9 +311,9 @@ class Evidence:
         sums = np.concatenate([known.crossed[id(rows)] for rows in self.extra], axis=2)
         return replace(known, further=further, further_sums=sums)
 
-    def _further(self, columns: Mapping[Key, Floats], groups: Sequence[Rows]) -> Floats:
+    def _further(self, columns: _Columns, groups: Sequence[Rows]) -> Floats:
         """Products (blocks, k, w) of padded columns with groups of further columns."""
-        return self._cross(columns, self._together(groups))
+        return self._cross(_made(columns), self._together(groups))
 
     def _together(self, groups: Sequence[Rows]) -> dict[Key, Floats]:
         """Groups of further columns side by side, padded, by key."""
@@ -317,8 +322,8 @@ class Evidence:
             joined, size, place = dict[Key, Floats](), sum(map(_width, groups)), 0
             for rows in groups:
                 for key, values in self._known[id(rows)][1].items():
-                    wide = joined.setdefault(key, np.zeros((*values.shape[:2], size)))
-                    wide[:, :, place : place + _width(rows)] = values
+                    wide = joined.setdefault(key, np.zeros((len(values), size)))
+                    wide[:, place : place + _width(rows)] = values
                 place += _width(rows)
             self._joined[names] = joined
         return self._joined[names]
@@ -336,32 +341,26 @@ class Evidence:
 
     def _cross(self, a: Mapping[Key, Floats], b: Mapping[Key, Floats]) -> Floats:
         """Products (blocks, k, l) of two groups of padded columns."""
-        width = (next(iter(a.values())).shape[2], next(iter(b.values())).shape[2]) if b else (0, 0)
-        total = np.zeros((self.blocks, *width))
+        k, width = (next(iter(a.values())).shape[1], next(iter(b.values())).shape[1]) if b else (0, 0)
+        total, places = np.zeros((self.blocks, k, width)), np.arange(width)
         # In a fixed order: the last digits of a sum depend on it.
         for key in sorted(a.keys() & b.keys()):
-            on = _active(a[key])
-            total[on] += self._weights[key] * np.matmul(a[key][on].transpose(0, 2, 1), b[key][on])
+            _add_products(a[key], b[key], self._starts[key[0]], self._weights[key], places, total)
         return total
 
     def alone(self, columns: Mapping[Key, Floats]) -> Products:
         """Products of padded columns with the base, themselves and the torques."""
-        width = next(iter(columns.values())).shape[2]
+        width = next(iter(columns.values())).shape[1]
         base = np.zeros((self.blocks, width, self.base_count))
         own = np.zeros((self.blocks, width, width))
-        target = np.zeros((self.blocks, width))
+        target = np.zeros((self.blocks, width, 1))
+        places = np.arange(width)
         for key, wide in columns.items():
-            on = _active(wide)
-            matrix = wide[on]
-            turned = self._weights[key] * matrix.transpose(0, 2, 1)
-            products = np.matmul(turned, self._columns[key][on])
-            if isinstance(on, slice):
-                base[:, :, self._acting[key]] += products
-            else:
-                base[on[:, None, None], np.arange(width)[:, None], self._acting[key]] += products
-            own[on] += np.matmul(turned, matrix)
-            target[on] += np.matmul(turned, self._targets[key][on])[:, :, 0]
-        return Products(base, own, target, self.parts)
+            starts, weight = self._starts[key[0]], self._weights[key]
+            _add_products(wide, self._columns[key], starts, weight, self._acting[key], base)
+            _add_products(wide, wide, starts, weight, places, own)
+            _add_products(wide, self._targets[key], starts, weight, places[:1], target)
+        return Products(base, own, target[:, :, 0], self.parts)
 
     # ---- scores ----
 
@@ -381,6 +380,10 @@ class Evidence:
         known : their products with the base alone, to save time.
         """
         return self.score_products(self.products(columns, known), list(columns), ridge=ridge, pull=pull)
+
+    def score_rows(self, rows: Rows, known: Products, *, pull: float = 0.0) -> Score:
+        """Score of rows with known products with the base alone."""
+        return self.score_products(self.products(partial(self.padded, rows), known), list(rows), pull=pull)
 
     def score_products(
         self, products: Products, keys: Sequence[Key], *, ridge: float = 0.0, pull: float = 0.0
@@ -461,7 +464,7 @@ class Evidence:
 
     def block_of(self, side: str) -> Floats:
         """Number (m,) of the block of each row of a side, -1 for held-out rows."""
-        return self._place[side][0].astype(float)
+        return self._block[side].astype(float)
 
     def residuals(self, *, test: bool = False) -> dict[str, Floats]:
         """Residual (m, n) by side with the present columns, NaN in unused rows; `test` : of held-out rows instead."""
@@ -479,20 +482,19 @@ class Evidence:
         for side, rows in self.nominal.rows.items():
             out = np.full(rows.target.shape, np.nan)
             for part, fit in zip(self.parts, self._held, strict=True):
-                mine = (part > 0.0)[self._place[side][0]]
+                mine = (part > 0.0)[self._block[side]]
                 out[mine] = rows.target[mine] - self.predicted(side, fit.values, mine)
             found[side] = np.where(rows.valid & ~rows.test[:, None], out, np.nan)
         return found
 
     def predicted(self, side: str, values: Floats, mine: NDArray[np.bool_] | None = None) -> Floats:
         """Torques (rows, n) [Nm] of the rows `mine` (m,), default all, with values (P,) of the present columns."""
-        mine = np.ones(len(self.nominal.rows[side].time), dtype=bool) if mine is None else mine
-        p = self.base_count
-        predicted = np.einsum("jmp,p->mj", self.nominal.rows[side].matrix[:, mine], values[:p])
+        p, some = self.base_count, slice(None) if mine is None else mine
+        predicted = np.stack([table[some] @ values[:p] for table in self.nominal.rows[side].matrix], axis=1)
         for here, rows in self._places():
             for (of_side, j), columns in rows.items():
                 if of_side == side:
-                    predicted[:, j] += columns[mine] @ values[here]
+                    predicted[:, j] += columns[some] @ values[here]
         return predicted
 
     def covariance(self, fit: Fit | None = None) -> Floats:
@@ -500,10 +502,9 @@ class Evidence:
         independent rows."""
         fit = fit or self.full
         scores = self.target - self.gram @ fit.values
-        middle = self.blocks / max(self.blocks - 1, 1) * scores.T @ scores
-        sandwich = fit.inverse @ middle @ fit.inverse
-        # The variance of columns without excitation is zero, on either side of it by rounding.
-        np.fill_diagonal(sandwich, np.maximum(np.diag(sandwich), 0.0))
+        # A product with its own transpose keeps every variance above zero by rounding, and every correlation below one.
+        moved = np.sqrt(self.blocks / max(self.blocks - 1, 1)) * scores @ fit.inverse
+        sandwich = moved.T @ moved
         return _widened(sandwich, fit.inverse)
 
     def free(self) -> tuple[Floats, Floats]:
@@ -523,10 +524,29 @@ def _width(rows: Rows) -> int:
     return next(iter(rows.values())).shape[1]
 
 
-def _active(columns: Floats) -> slice | NDArray[np.int64]:
-    """Blocks in which padded columns (blocks, L, k) act."""
-    found = np.flatnonzero(columns.any(axis=(1, 2)))
-    return slice(None) if len(found) == len(columns) else found
+def _made(columns: _Columns) -> Mapping[Key, Floats]:
+    return columns() if callable(columns) else columns
+
+
+@njit(cache=True, nogil=True)
+def _add_products(one, other, starts, weight, places, out):  # type: ignore[no-untyped-def]
+    """Add the weighted products of (r, k) and (r, l) in each block to the `places` (l,) of (blocks, k, p)."""
+    k, width = one.shape[1], other.shape[1]
+    total = np.zeros((k, width))
+    for block in range(len(starts) - 1):
+        acts = False
+        for row in range(starts[block], starts[block + 1]):
+            for i in range(k):
+                value = weight * one[row, i]
+                if value != 0.0:
+                    acts = True
+                    for j in range(width):
+                        total[i, j] += value * other[row, j]
+        if acts:
+            for i in range(k):
+                for j in range(width):
+                    out[block, i, places[j]] += total[i, j]
+                    total[i, j] = 0.0
 
 
 def _sums(parts: Floats, values: Floats) -> Floats:

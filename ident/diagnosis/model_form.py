@@ -13,7 +13,9 @@ import numpy as np
 from ident.diagnosis.candidates import Dictionary, Trial
 from ident.diagnosis.evidence import Floats, Key, Rows
 from ident.diagnosis.probes import groups, hats_of
-from ident.effects import ZERO_OFFSET, Shape
+from ident.effects import ZERO_OFFSET, Column, Shape
+from ident.effects.effect import both_sides
+from ident.effects.motion import ArmMotion
 from ident.effects.nameless import hats
 
 
@@ -31,7 +33,7 @@ def model_form_error(dictionary: Dictionary, trial: Trial) -> Rows | None:
         return beside or None
     name = "time" if effect.law.variable == "time" else f"{effect.law.variable}{joint + 1}"
     found: dict[Key, Floats] = {}
-    own = {key: value for key, value in hats_of(dictionary).items() if key == name}
+    own = hats_of(dictionary, name)
     for side, at in trial.rows:
         if at != joint or not own:
             continue
@@ -52,15 +54,14 @@ def companions(dictionary: Dictionary, trial: Trial) -> Rows | None:
     effect, joint, nominal = trial.candidate.effect, trial.candidate.joint, dictionary.nominal
     own = max(joint, 0)
     parts: dict[Key, list[Floats]] = {}
-    by_motion = [effect.companions(m, own, dictionary.setting) for m in nominal.motions]
-    for columns in zip(*by_motion, strict=True):
-        for side, at in trial.rows:
-            if joint >= 0 and at != joint:
-                continue
-            wide = [column.wide(own, nominal.arm.chain.n)[side == "joint"] for column in columns]
-            signals = [signal[:, at] for signal in wide if signal is not None]
-            if signals:
-                parts.setdefault((side, at), []).append(nominal.reduce(side, signals))
+    columns = nominal.columns(lambda motion: effect.companions(motion, own, dictionary.setting))
+    for side, at in trial.rows:
+        if joint >= 0 and at != joint:
+            continue
+        # A column of one joint acts on no other.
+        for rows in columns[side]:
+            if rows.ndim == 2 or at == own:
+                parts.setdefault((side, at), []).append(rows if rows.ndim == 1 else rows[:, at])
     found = {key: np.column_stack(columns) for key, columns in parts.items()}
     if effect.whole_arm:
         # A body adds nothing before it is attached, nor to other joints.
@@ -70,31 +71,32 @@ def companions(dictionary: Dictionary, trial: Trial) -> Rows | None:
 
 def _of_speed(dictionary: Dictionary, side: str, joint: int) -> Floats:
     """Functions (m, k) of a drive's speed and its direction, finer at low speed, where friction laws differ most."""
-    motions = dictionary.nominal.motions
-    roots = [np.sqrt(np.abs(m.motor_speed[:, joint])) for m in motions]
-    high = max(float(root.max()) for root in roots)
-    parts = [hats(root, 0.0, high)[:, 1:] for root in roots]
-    signed = [part * m.direction[:, joint : joint + 1] for part, m in zip(parts, motions, strict=True)]
-    both = [np.column_stack(pair) for pair in zip(parts, signed, strict=True)]
-    return dictionary.nominal.reduce(side, both)
+    nominal = dictionary.nominal
+    high = float(np.sqrt(max(np.abs(m.motor_speed[:, joint]).max() for m in nominal.motions)))
+
+    def made(motion: ArmMotion) -> tuple[Column, ...]:
+        part = hats(np.sqrt(np.abs(motion.motor_speed[:, joint])), 0.0, high)[:, 1:]
+        both = np.column_stack([part, part * motion.direction[:, joint : joint + 1]])
+        return (Column(motor=both, joint=both),)
+
+    return nominal.columns(made, [side])[side][0]
 
 
 def _twist(dictionary: Dictionary, joint: int) -> Rows | None:
     """Change of all torques by a turn of the joint by each hat function of its load."""
     nominal = dictionary.nominal
-    loads = hats_of(dictionary).get(f"load{joint + 1}")
+    loads = hats_of(dictionary, f"load{joint + 1}").get(f"load{joint + 1}")
     if loads is None:
         return None
-    turns = [ZERO_OFFSET.columns(m, joint, Shape())[0] for m in nominal.motions]
+
+    def made(motion: ArmMotion) -> list[Column]:
+        turn = ZERO_OFFSET.columns(motion, joint, Shape())[0].motor
+        assert turn is not None
+        of_load = loads.hats(motion)
+        return [both_sides(turn[:, k : k + 1] * of_load) for k in range(motion.n)]
+
     found: dict[Key, Floats] = {}
-    for side in nominal.rows:
-        parts = [
-            turn.wide(joint, m.n)[side == "joint"] for turn, m in zip(turns, nominal.motions, strict=True)
-        ]
-        for k in range(nominal.arm.chain.n):
-            signals = [p[:, k : k + 1] * h for p, h in zip(parts, loads.hats, strict=True) if p is not None]
-            columns = nominal.reduce(side, signals)
-            if np.any(columns):
-                found[side, k] = columns
+    for side, columns in nominal.columns(made).items():
+        found |= {(side, k): rows for k, rows in enumerate(columns) if np.any(rows)}
     # A turn about an axis along gravity changes no torque.
     return found or None

@@ -11,12 +11,13 @@ follows from the predicted torque, so no sensor's noise or error leaks from one 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.sparse import csr_array
@@ -28,18 +29,24 @@ from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, Coupling, DriveMotion, ModelStructure, Side
-from ident.effects import effects_torque
+from ident.effects import Column, effects_torque
 from ident.effects.motion import ArmMotion, dahl, in_order
 from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.binned import Motion, binned_regressor, bins
-from ident.rows.filters import differentiate, low_pass
-from lwr_driver.session.spool import Arena
+from ident.rows.filters import differentiate, low_pass, settling
+from lwr_driver.session.spool import Arena, column, spans, stored, stored_together
 
 Floats = NDArray[np.float64]
 
 # Least share of a low-passed row from samples of a moving joint.
 _KNOWN = 0.8
+# Samples of a block of a whole motion.
+_BLOCK = 2**16
+# Samples of a motion in work together, and least share in use for a slice of them.
+_TOGETHER, _DENSE = 2**14, 0.6
+# Samples without use between two parts of a motion.
+_GAP = 1000
 # Length of the windows used of a long session [s].
 _WINDOW_S = 10.0
 # Compliance [rad/Nm] of a joint taken as rigid.
@@ -89,9 +96,8 @@ class NominalArm:
         two of them (Maxwell slip: asperities of several lengths side by side)."""
         found = np.sign(speed)
         if self.presliding is not None:
-            path = np.cumsum(speed, axis=0) * dt
             for joint in np.flatnonzero(self.presliding > 0.0):
-                along = np.ascontiguousarray(path[:, joint])
+                along = np.cumsum(speed[:, joint]) * dt
                 start = float(found[0, joint])
                 found[:, joint] = dahl(along, float(self.presliding[joint]), start)
                 if self.far is not None and self.far_share is not None and self.far_share[joint] != 0.0:
@@ -143,6 +149,9 @@ class Nominal:
     _operators: dict[tuple[str, int, float], tuple[csr_array, float]] = field(
         default_factory=dict, init=False, repr=False
     )
+    _pieces: dict[tuple[object, ...], list[list[_Piece]]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def __post_init__(self) -> None:
         self.motions = self.motions or in_order([self._motion(r, s, s.effort) for r, s in self.stretches])
@@ -178,9 +187,10 @@ class Nominal:
         motions = []
         for before, (recording, stretch) in zip(self.motions, self.stretches, strict=True):
             body = bodies[recording.payload]
-            link = self._link_torque(before.q, before.qd, before.qdd, body, drive)
+            link = self._link_torque_in_blocks(before, body, drive)
             motions.append(self._motion(recording, stretch, link, body, drive))
         self.motions = in_order(motions)
+        self._pieces.clear()
         self._make_rows()
 
     def _link_torque(
@@ -189,6 +199,25 @@ class Nominal:
         """Torque (N, n) [Nm] through the joints."""
         rigid = regressor.torque(self.arm.chain, q, qd, qdd, bodies)
         return rigid + drive["Fvl"] * qd + drive["Fcl"] * np.sign(qd) + drive["offl"]
+
+    def _link_torque_in_blocks(
+        self, motion: ArmMotion, bodies: Floats, drive: Mapping[str, Floats]
+    ) -> Floats:
+        """The same along a motion, in a file for a long one."""
+        parts = (motion.part(some) for some in spans(len(motion.time), _BLOCK))
+        return stored(self._link_torque(one.q, one.qd, one.qdd, bodies, drive) for one in parts)
+
+    def _twist(
+        self, torque: Floats, dt: float, cutoff: float
+    ) -> Iterator[tuple[slice, Floats, Floats, Floats]]:
+        """Twist of the joints and its derivatives (m, n) in blocks, from a torque (N, n)."""
+        reach = int(np.ceil(settling(cutoff) / dt)) + 4
+        for some in spans(len(torque), _BLOCK):
+            low = max(some.start - reach, 0)
+            twist = low_pass(torque[low : some.stop + reach], dt, cutoff) * self.arm.compliance
+            first, second = differentiate(twist, dt)
+            own = slice(some.start - low, some.stop - low)
+            yield some, twist[own], first[own], second[own]
 
     def _hanging(
         self, motors: RecordStretch, q: Floats, qd: Floats, bodies: Floats, drive: Mapping[str, Floats]
@@ -219,18 +248,27 @@ class Nominal:
             # A measured torque is noisy, and its second derivative more so; a predicted one is not.
             wanted = self.settings.deflection_hz if bodies is not None else 20.0
             wanted = 10.0 if self.arm.encoder == "motor" else wanted
-            twist = low_pass(link_torque, dt, min(wanted, 0.2 / dt)) * self.arm.compliance
-            first, second = differentiate(twist, dt)
+            twisted = self._twist(link_torque, dt, min(wanted, 0.2 / dt))
             if self.arm.encoder == "link":
-                speed, acceleration = speed + first, acceleration + second
+                speed, acceleration = stored_together(
+                    (qd[some] + first, qdd[some] + second) for some, _, first, second in twisted
+                )
             else:
-                q, qd, qdd = q - twist, qd - first, qdd - second
+                q, qd, qdd = stored_together(
+                    (q[some] - twist, qd[some] - first, qdd[some] - second)
+                    for some, twist, first, second in twisted
+                )
+                speed, acceleration = stretch.qd, stretch.qdd
                 if bodies is not None and drive is not None:
                     q, qd, qdd, springs = self._hanging(stretch, q, qd, bodies, drive)
                     link_torque = self._link_torque(q, qd, qdd, bodies, drive)
         values = drive or dict.fromkeys(("Ia", "Fvm", "Fcm", "offm", "Fcl"), np.zeros(n))
-        slip = self.arm.slip(speed, dt)
-        friction = values["Fvm"] * speed + values["Fcm"] * slip
+        slip = stored([self.arm.slip(speed, dt)])
+
+        def driving(some: slice) -> Floats:
+            friction = values["Fvm"] * speed[some] + values["Fcm"] * slip[some]
+            return link_torque[some] + values["Ia"] * acceleration[some] + friction + values["offm"]
+
         return ArmMotion(
             chain=self.arm.chain,
             bodies=np.zeros((n, 10)) if bodies is None else bodies,
@@ -243,7 +281,7 @@ class Nominal:
             motor_speed=speed,
             motor_acceleration=acceleration,
             joint_torque=link_torque,
-            motor_torque=link_torque + values["Ia"] * acceleration + friction + values["offm"],
+            motor_torque=stored(driving(some) for some in spans(len(speed), _BLOCK)),
             gear_ratio=self.arm.gear_ratio,
             inertia=values["Ia"],
             link_coulomb=values["Fcl"],
@@ -294,6 +332,62 @@ class Nominal:
                 parts.append(rows)
         whole = np.concatenate(parts)
         return whole[:, 0] if values[0].ndim == 1 else whole
+
+    def columns(
+        self, made: Callable[[ArmMotion], Sequence[Column]], sides: Sequence[str] | None = None
+    ) -> dict[str, list[Floats]]:
+        """Rows (m,) or (m, n) of columns by side, made from one part of the motions after the other.
+
+        made : the columns of a part, of the same shape in each. sides : to look at, default all. A column without
+        values on a side is left out there.
+        """
+        sides = tuple(side for side in self.sides if sides is None or side in sides)
+        key = (*sides, self.arm.motor_delay_s, self.arm.joint_delay_s)
+        if key not in self._pieces:
+            self._pieces[key] = [
+                list(self._cut(sides, number, *pair)) for number, pair in enumerate(self.stretches)
+            ]
+        found: dict[str, dict[int, list[Floats]]] = {side: {} for side in sides}
+        for number, (pieces, (recording, stretch)) in enumerate(
+            zip(self._pieces[key], self.stretches, strict=True)
+        ):
+            rows: dict[tuple[str, int], Floats] = {}
+            for piece in pieces:
+                for k, one in enumerate(made(piece.motion)):
+                    for side, gather in piece.gathers.items():
+                        values = one.motor if side == "motor" else one.joint
+                        if values is None:
+                            continue
+                        if (side, k) not in rows:
+                            count = self._operator(side, number, recording, stretch)[0].shape[0]
+                            rows[side, k] = np.zeros((count, *values.shape[1:]))
+                        gather.add(values, rows[side, k])
+            for (side, k), values in rows.items():
+                if self.band_hz[side] is not None:
+                    dt = self._operator(side, number, recording, stretch)[1]
+                    chosen = self._windows(recording, self._stamps(side, stretch))
+                    wide = self._slow(side, values.reshape(len(values), -1), dt)[chosen]
+                    values = wide.reshape(len(wide), *values.shape[1:])
+                found[side].setdefault(k, []).append(values)
+        return {side: [np.concatenate(parts) for parts in of.values()] for side, of in found.items()}
+
+    def _cut(
+        self, sides: Sequence[str], number: int, recording: SessionRecord, stretch: RecordStretch
+    ) -> Iterator[_Piece]:
+        """Parts of a motion that fit into the processor's cache, with the samples in use alone."""
+        held = [side for side in sides if _holds(recording, stretch, side)]
+        operators = {side: self._operator(side, number, recording, stretch)[0].tocsc() for side in held}
+        used = np.zeros(len(stretch.time), dtype=bool)
+        for operator in operators.values():
+            used |= np.diff(operator.indptr) > 0
+        places = np.flatnonzero(used)
+        gaps = np.flatnonzero(np.diff(places) > _GAP) + 1
+        runs = (run[some] for run in np.split(places, gaps) for some in spans(len(run), _TOGETHER))
+        for here in runs:
+            whole = slice(int(here[0]), int(here[-1]) + 1)
+            picked = whole if len(here) > _DENSE * (whole.stop - whole.start) else here
+            parts = {side: _gather(operator[:, picked]) for side, operator in operators.items()}
+            yield _Piece(self.motions[number].part(picked), parts)
 
     def _operator(
         self, side: str, number: int, recording: SessionRecord, stretch: RecordStretch
@@ -364,12 +458,21 @@ class Nominal:
         self.rows = {side: self._side_rows(side) for side in self.sides}
         for side in self.sides if self.arm.healthy else ():
             of: Side = "motor" if side == "motor" else "joint"
-            torques = [effects_torque(self.arm.healthy, m, side=of, measured=True) for m in self.motions]
-            rows = self.rows[side]
-            self.rows[side] = replace(rows, target=rows.target - self.reduce(side, torques))
+            rows, torque = self.rows[side], self._healthy_torque(of)
+            self.rows[side] = replace(rows, target=rows.target - torque)
+
+    def _healthy_torque(self, side: Side) -> Floats:
+        """Torque (m, n) [Nm] of the healthy arm's own effects."""
+
+        def made(motion: ArmMotion) -> tuple[Column, ...]:
+            torque = effects_torque(self.arm.healthy, motion, side=side, measured=True)
+            return (Column(motor=torque) if side == "motor" else Column(joint=torque),)
+
+        return self.columns(made, [side])[side][0]
 
     def _side_rows(self, side: str) -> SideRows:
-        parts = []
+        parts: list[tuple[Any, ...]] = []
+        matrices: list[Callable[[], Floats]] = []
         for motion, (recording, stretch) in zip(self.motions, self.stretches, strict=True):
             if not _holds(recording, stretch, side):
                 continue
@@ -379,45 +482,64 @@ class Nominal:
                 target, usable, speed = stretch.motor, stretch.motor_usable, motion.motor_speed
             else:
                 target, usable, speed = stretch.effort, stretch.usable, motion.qd
-            moves = (np.abs(_at(stretch.time, speed, at)) > self.settings.standstill_rad_s) & (
-                _at(stretch.time, self._steady(speed, stretch), at) > 0.999
-            )
+            moves = self._moves(stretch, speed, at)
             dt = width * usual_step(stamp)
             stamps = self._stamps(side, stretch)
             chosen = self._windows(recording, stamps)
-            if self.band_hz[side] is None:
-                # The rows in use alone.
-                used = at[: len(at) // width * width].reshape(-1, width)[chosen].reshape(-1)
-                matrix = self._matrix(side, motion, recording, stretch.time, used, width)
-            else:
-                wide = self._matrix(side, motion, recording, stretch.time, at, width)
-                matrix = np.stack([self._slow(side, table, dt) for table in wide])[:, chosen]
+            matrices.append(partial(self._used_matrix, side, motion, recording, stretch, chosen))
             torque = self._slow(side, bins(target, width), dt)
             if self.band_hz[side] is not None:
                 # The columns pass through the same low-pass, so rounded reversals cancel; only longer rests are
                 # unknown.
                 valid = self._slow(side, bins((usable & moves).astype(float), width), dt) > _KNOWN
             else:
-                moves = bins(moves.astype(float), width) > 1.0 - 1e-9
+                moves = _whole(moves, width)
                 if side == "joint":
                     # The positions' low-pass rounds the corner made by the link's Coulomb friction.
                     span = max(at[-1] - at[0], 1e-9)
                     moves = _guarded(moves, round(self.settings.guard_s * len(moves) / span))
-                valid = (bins(usable.astype(float), width) > 1.0 - 1e-9) & moves
+                valid = _whole(usable, width) & moves
             session, test = (np.full(int(chosen.sum()), v) for v in (recording.number, recording.test))
-            usual = torque[chosen], (valid & self.moving)[chosen], session, stamps[chosen], test
-            parts.append((matrix, *usual))
-        matrices, *others = zip(*parts, strict=True)
-        return SideRows(
-            Arena().keep(np.concatenate(matrices, axis=1)), *(np.concatenate(part) for part in others)
-        )
+            parts.append((torque[chosen], (valid & self.moving)[chosen], session, stamps[chosen], test))
+        others = [np.concatenate(part) for part in zip(*parts, strict=True)]
+        # One stretch in memory at a time.
+        matrix = Arena().keep(np.empty((self.arm.chain.n, len(others[0]), len(self.base))))
+        first = 0
+        for (torque, *_), make in zip(parts, matrices, strict=True):
+            matrix[:, first : first + len(torque)] = make()
+            first += len(torque)
+        return SideRows(matrix, *others)
 
-    def _steady(self, speed: Floats, stretch: RecordStretch) -> Floats:
-        """1 where a joint keeps its direction for a while before and after, 0 elsewhere, (N, n)."""
+    def _used_matrix(
+        self,
+        side: str,
+        motion: ArmMotion,
+        recording: SessionRecord,
+        stretch: RecordStretch,
+        chosen: NDArray[np.bool_],
+    ) -> Floats:
+        """(n, m, p) regressor of the `chosen` rows of one stretch and side."""
+        stamp, delay, width = self._sampling(side, stretch)
+        at = stamp - delay
+        if self.band_hz[side] is None:
+            # The rows in use alone.
+            used = at[: len(at) // width * width].reshape(-1, width)[chosen].reshape(-1)
+            return self._matrix(side, motion, recording, stretch.time, used, width)
+        wide = self._matrix(side, motion, recording, stretch.time, at, width)
+        return np.stack([self._slow(side, table, width * usual_step(stamp)) for table in wide])[:, chosen]
+
+    def _moves(self, stretch: RecordStretch, speed: Floats, at: Floats) -> NDArray[np.bool_]:
+        """Whether joints move in one direction for a while before and after times (m,), (m, n)."""
         dt = float(stretch.time[1] - stretch.time[0])
         size = 2 * round(self.settings.reversal_s / dt) + 1
-        same = (minimum_filter1d(speed, size, axis=0) > 0.0) | (maximum_filter1d(speed, size, axis=0) < 0.0)
-        return same.astype(float)
+        found = np.empty((len(at), speed.shape[1]), dtype=bool)
+        for joint in range(speed.shape[1]):
+            # One joint of a long session at a time.
+            own = column(speed, joint)
+            steady = (minimum_filter1d(own, size) > 0.0) | (maximum_filter1d(own, size) < 0.0)
+            moves = np.abs(_at(stretch.time, own[:, None], at)) > self.settings.standstill_rad_s
+            found[:, joint] = (moves & (_at(stretch.time, steady[:, None].astype(float), at) > 0.999))[:, 0]
+        return found
 
     def _matrix(
         self, side: str, motion: ArmMotion, recording: SessionRecord, grid: Floats, at: Floats, width: int
@@ -444,8 +566,66 @@ class Nominal:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class _Gather:
+    """A part of an operator: rows from `first` on, made from samples of a part of a motion (CSR)."""
+
+    first: int
+    starts: NDArray[np.int32]
+    samples: NDArray[np.int32]
+    weights: Floats
+
+    def add(self, values: Floats, rows: Floats) -> None:
+        """Add what samples (N,) or (N, k) contribute to rows (m,) or (m, k)."""
+        here = rows[self.first : self.first + len(self.starts) - 1]
+        if values.ndim == 1:
+            _add_one(self.starts, self.samples, self.weights, values, here)
+        else:
+            _add_many(self.starts, self.samples, self.weights, values, here)
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """A part of a motion and its share of the rows of each side."""
+
+    motion: ArmMotion
+    gathers: dict[str, _Gather]
+
+
+def _gather(operator: Any) -> _Gather:
+    """The rows that are not empty of an operator (m, N), which are neighbours."""
+    matrix = csr_array(operator)
+    full = np.flatnonzero(np.diff(matrix.indptr))
+    first, last = (int(full[0]), int(full[-1]) + 1) if len(full) else (0, 0)
+    starts = matrix.indptr[first : last + 1].astype(np.int32)
+    return _Gather(first, starts, matrix.indices.astype(np.int32), matrix.data)
+
+
+@njit(cache=True, nogil=True)
+def _add_one(starts, samples, weights, values, rows):  # type: ignore[no-untyped-def]
+    for row in range(len(starts) - 1):
+        total = 0.0
+        for k in range(starts[row], starts[row + 1]):
+            total += weights[k] * values[samples[k]]
+        rows[row] += total
+
+
+@njit(cache=True, nogil=True)
+def _add_many(starts, samples, weights, values, rows):  # type: ignore[no-untyped-def]
+    for row in range(len(starts) - 1):
+        for k in range(starts[row], starts[row + 1]):
+            for own in range(values.shape[1]):
+                rows[row, own] += weights[k] * values[samples[k], own]
+
+
 def _holds(recording: SessionRecord, stretch: RecordStretch, side: str) -> bool:
     return side in recording.sides and (side == "joint" or len(stretch.motor_time) > 1)
+
+
+def _whole(flags: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
+    """Whether all `width` samples of a bin are set, (m, n) of (N, n)."""
+    count = len(flags) // width
+    return np.asarray(flags[: count * width].reshape(count, width, -1).all(axis=1))
 
 
 def _guarded(moves: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:

@@ -8,19 +8,20 @@ extended model, or is reported by its variables; a large one casts doubt on the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from bisect import insort
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import median_filter
 
 from ident.diagnosis.candidates import Dictionary
 from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
 from ident.diagnosis.nominal import TRAVEL_RAD
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.effects import NAMELESS
+from ident.effects import NAMELESS, Column
+from ident.effects.motion import ArmMotion
 from ident.effects.nameless import KNOTS, hats
-from lwr_driver.session.spool import spans
 
 # Lowest frequency distinguishable from a drift in a session [Hz].
 _LOWEST_HZ = 0.3
@@ -32,8 +33,6 @@ _STANDS_OUT = 16.0
 _IN_EACH = 4.0
 # Zero padding of the spectrum, against lines between two of its frequencies.
 _PADDING = 4
-# Windows of a median in memory together.
-_TOGETHER = 1024
 _RIDGE = 1e-3
 # Least explained share of the noise; generic functions find a little everywhere.
 _LEAST_INFLATION = 0.012
@@ -84,14 +83,21 @@ def find_line(evidence: Evidence, side: str, joint: int, residual: Floats) -> tu
 
 def _medians(power: Floats, width: int) -> Floats:
     """Median (m,) of each value and of `width` values on either side, fewer at the ends."""
-    inner = np.arange(width, len(power) - width)
-    found = np.empty(len(power))
-    if len(inner):
-        windows = sliding_window_view(power, 2 * width + 1)
-        for some in spans(len(inner), _TOGETHER):
-            found[inner[some]] = np.median(windows[some], axis=1)
-    for k in [*range(min(width, len(power))), *range(max(len(power) - width, width), len(power))]:
-        found[k] = np.median(power[max(0, k - width) : k + width + 1])
+    if len(power) <= 2 * width:
+        return np.array([np.median(power[max(0, k - width) : k + width + 1]) for k in range(len(power))])
+    found: Floats = median_filter(power, 2 * width + 1, mode="nearest")
+    found[:width] = _growing(power[: 2 * width], width)
+    found[len(power) - width :] = _growing(power[: -2 * width - 1 : -1], width)[::-1]
+    return found
+
+
+def _growing(values: Floats, width: int) -> list[float]:
+    """Medians of the first `width` + 1, + 2, ... values, `width` of them."""
+    ordered, found = sorted(values[:width].tolist()), []
+    for value in values[width : 2 * width].tolist():
+        insort(ordered, value)
+        half = len(ordered) // 2
+        found.append(0.5 * (ordered[half] + ordered[~half]))
     return found
 
 
@@ -133,11 +139,18 @@ Null = Mapping[tuple[str, int], float]
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A variable over its range: hat functions (N, 7) of each motion, with knots evenly from `low` to `high`."""
+    """A variable over its range, with the knots of its hat functions evenly from `low` to `high`.
+
+    of : its values (N,) in a motion.
+    """
 
     low: float
     high: float
-    hats: list[Floats]
+    of: Callable[[ArmMotion], Floats]
+
+    def hats(self, motion: ArmMotion) -> Floats:
+        """Hat functions (N, 7)."""
+        return hats(self.of(motion), self.low, self.high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,21 +279,26 @@ def remainder_gains(dictionary: Dictionary, evidence: Evidence) -> dict[tuple[st
     return found
 
 
-def hats_of(dictionary: Dictionary) -> dict[str, Curve]:
-    """Hat functions of every variable by its name."""
-    motions = dictionary.nominal.motions
-    variables: dict[str, list[Floats]] = {"time": [m.time for m in motions]}
-    for k in range(dictionary.nominal.arm.chain.n):
-        variables[f"q{k + 1}"] = [m.q[:, k] for m in motions]
-        variables[f"qd{k + 1}"] = [m.motor_speed[:, k] for m in motions]
-        variables[f"qdd{k + 1}"] = [m.motor_acceleration[:, k] for m in motions]
-        variables[f"load{k + 1}"] = [m.joint_torque[:, k] for m in motions]
+def hats_of(dictionary: Dictionary, only: str | None = None) -> dict[str, Curve]:
+    """The curve of every variable by its name, or of one of them."""
     found = {}
-    for name, values in variables.items():
-        low = min(float(v.min()) for v in values)
-        high = max(float(v.max()) for v in values)
+    for name, of in _variables(dictionary.nominal.arm.chain.n).items():
+        if only is not None and name != only:
+            continue
+        values = [of(m) for m in dictionary.nominal.motions]
+        low, high = min(float(v.min()) for v in values), max(float(v.max()) for v in values)
         if high - low >= (TRAVEL_RAD if name[1:].isdigit() else 1e-6):
-            found[name] = Curve(low, high, [hats(v, low, high) for v in values])
+            found[name] = Curve(low, high, of)
+    return found
+
+
+def _variables(joints: int) -> dict[str, Callable[[ArmMotion], Floats]]:
+    found: dict[str, Callable[[ArmMotion], Floats]] = {"time": lambda m: m.time}
+    for k in range(joints):
+        found[f"q{k + 1}"] = lambda m, k=k: m.q[:, k]  # type: ignore[misc]
+        found[f"qd{k + 1}"] = lambda m, k=k: m.motor_speed[:, k]  # type: ignore[misc]
+        found[f"qdd{k + 1}"] = lambda m, k=k: m.motor_acceleration[:, k]  # type: ignore[misc]
+        found[f"load{k + 1}"] = lambda m, k=k: m.joint_torque[:, k]  # type: ignore[misc]
     return found
 
 
@@ -288,18 +306,21 @@ def groups(
     dictionary: Dictionary, variables: Mapping[str, Curve], side: str, joint: int
 ) -> dict[str, dict[Key, Floats]]:
     """Groups of columns by the names of their variables."""
-    nominal, found = dictionary.nominal, {}
-    signs = [m.direction[:, joint : joint + 1] for m in nominal.motions]
-    loads = [m.joint_torque[:, joint : joint + 1] for m in nominal.motions]
+    found: dict[str, dict[Key, Floats]] = {}
     for name, curve in variables.items():
-        parts, of = curve.hats, name.rstrip("0123456789")
+        of = name.rstrip("0123456789")
         if of in ("load", "qdd") and name != f"{of}{joint + 1}":
             continue
-        found[name] = {(side, joint): nominal.reduce(side, parts)}
-        factors = {} if of == "qd" else {f"sign(qd{joint + 1})": signs}
-        if of == "q":
-            factors[f"load{joint + 1}"] = loads
-        for factor, values in factors.items():
-            scaled = [part * value for part, value in zip(parts, values, strict=True)]
-            found[f"{name} {factor}"] = {(side, joint): nominal.reduce(side, scaled)}
+        names = [name]
+        names += [] if of == "qd" else [f"{name} sign(qd{joint + 1})"]
+        names += [f"{name} load{joint + 1}"] if of == "q" else []
+
+        def made(motion: ArmMotion, curve: Curve = curve, names: list[str] = names) -> list[Column]:
+            parts = curve.hats(motion)
+            factors = motion.direction[:, joint : joint + 1], motion.joint_torque[:, joint : joint + 1]
+            scaled = [parts, *(parts * factor for factor, _ in zip(factors, names[1:], strict=False))]
+            return [Column(motor=one) if side == "motor" else Column(joint=one) for one in scaled]
+
+        columns = dictionary.nominal.columns(made, [side])[side]
+        found |= {one: {(side, joint): values} for one, values in zip(names, columns, strict=True)}
     return found

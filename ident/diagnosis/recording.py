@@ -19,6 +19,7 @@ from ident.rows.prepare import PreparedSession, prepare
 from ident.rows.sessions import payload_name, stated_mass
 from ident.rows.signal_choice import choose_signals
 from lwr_driver.session import Session
+from lwr_driver.session.spool import stored
 
 Floats = NDArray[np.float64]
 
@@ -187,5 +188,6 @@ def _stretches(prepared: PreparedSession, rate: float, stuck: Sequence[Stuck]) -
             x[pick] for x in (joint.times, joint.q, joint.qd, joint.qdd, joint.torque)
         )
         known = ~joint.flagged[pick]
+        q, qd, qdd, effort = (stored([x]) for x in (q, qd, qdd, effort))
         found.append(RecordStretch(time, q, qd, qdd, effort, known, motor_time, motor, usable))
     return found

@@ -33,6 +33,7 @@ class DiagnosisSettings:
     most_s : largest length of motion in use; evenly spread windows of longer sessions.
     delay_tolerance_s : largest delay of a channel as a property of the arm and not a finding.
     compliance_tolerance : the same of the joints' compliance, as a relative deviation.
+    jobs : threads for the candidates, with the same results for any number; -1 for one a core.
     """
 
     bin_s: float = 0.02
@@ -54,10 +55,13 @@ class DiagnosisSettings:
     delay_tolerance_s: float = 1.0e-3
     compliance_tolerance: float = 0.3
     seed: int = 1
+    jobs: int = 1
 
     def __post_init__(self) -> None:
         for name in ("bin_s", "deflection_hz", "block_s", "alpha", "least_gain", "most_s"):
             if not getattr(self, name) > 0.0:
                 raise ConfigurationError(f"`{name}` is {getattr(self, name)}; it must be positive")
+        if self.jobs == 0:
+            raise ConfigurationError("`jobs` is 0; give a number of threads, or -1 for one a core")
         if self.folds < 2:
             raise ConfigurationError(f"`folds` is {self.folds}; cross-validation needs at least 2")

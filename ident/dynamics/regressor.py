@@ -182,6 +182,7 @@ def _fill(q, qd, qdd, ca, sa, d, theta, r, prismatic, gravity, columns, out):  #
                 joint[4, s] = qdd[start + s, k]
             _cos_sin(joint[5], joint[0], joint[1], size)
             _advance(body, joint, ca[k], sa[k], d[k], prismatic[k], size)
+            _products(body, size)
             for j in range(k):
                 _carry(twist[j], joint, ca[k], sa[k], d[k], size)
             for s in range(size):
@@ -209,6 +210,7 @@ def _fill_at(q, qd, qdd, table, gravity, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, inline="always")
 def _advance(body, joint, ca, sa, d, prismatic, size):  # type: ignore[no-untyped-def]
+    # Three loops of few outputs: the compiler vectorises no loop of many.
     c, sn, r, speed, acceleration = joint[0], joint[1], joint[2], joint[3], joint[4]
     wx, wy, wz = body[0], body[1], body[2]
     ex, ey, ez = body[3], body[4], body[5]
@@ -223,27 +225,37 @@ def _advance(body, joint, ca, sa, d, prismatic, size):  # type: ignore[no-untype
         a0 = ax[s] + e1 * pz - e2 * py + w1 * u2 - w2 * u1
         a1 = ay[s] + e2 * px - e0 * pz + w2 * u0 - w0 * u2
         a2 = az[s] + e0 * py - e1 * px + w0 * u1 - w1 * u0
-        cs, ss, qd, qdd = c[s], sn[s], speed[s], acceleration[s]
+        cs, ss = c[s], sn[s]
         # into frame k: Rx(-alpha) then Rz(-theta)
-        t1, t2 = ca * w1 + sa * w2, ca * w2 - sa * w1
-        b0, b1, b2 = cs * w0 + ss * t1, cs * t1 - ss * w0, t2
-        t1, t2 = ca * e1 + sa * e2, ca * e2 - sa * e1
-        f0, f1, f2 = cs * e0 + ss * t1, cs * t1 - ss * e0, t2
         t1, t2 = ca * a1 + sa * a2, ca * a2 - sa * a1
-        g0, g1, g2 = cs * a0 + ss * t1, cs * t1 - ss * a0, t2
-        rate, rate2 = revolute * qd, 2.0 * prismatic * qd
-        wx[s], wy[s], wz[s] = b0, b1, b2 + rate
-        ex[s], ey[s], ez[s] = f0 + b1 * rate, f1 - b0 * rate, f2 + revolute * qdd
-        ax[s] = g0 + b1 * rate2
-        ay[s] = g1 - b0 * rate2
-        az[s] = g2 + prismatic * qdd
-        b2 = b2 + rate
-        body[9, s] = b0 * b0
-        body[10, s] = b1 * b1
-        body[11, s] = b2 * b2
-        body[12, s] = b0 * b1
-        body[13, s] = b0 * b2
-        body[14, s] = b1 * b2
+        ax[s], ay[s], az[s] = cs * a0 + ss * t1, cs * t1 - ss * a0, t2
+    for s in range(size):
+        cs, ss = c[s], sn[s]
+        w0, w1, w2 = wx[s], wy[s], wz[s]
+        t1, t2 = ca * w1 + sa * w2, ca * w2 - sa * w1
+        wx[s], wy[s], wz[s] = cs * w0 + ss * t1, cs * t1 - ss * w0, t2
+    for s in range(size):
+        cs, ss, qd, qdd = c[s], sn[s], speed[s], acceleration[s]
+        b0, b1, rate, rate2 = wx[s], wy[s], revolute * qd, 2.0 * prismatic * qd
+        e0, e1, e2 = ex[s], ey[s], ez[s]
+        t1, t2 = ca * e1 + sa * e2, ca * e2 - sa * e1
+        ex[s] = cs * e0 + ss * t1 + b1 * rate
+        ey[s] = cs * t1 - ss * e0 - b0 * rate
+        ez[s] = t2 + revolute * qdd
+        ax[s] += b1 * rate2
+        ay[s] -= b0 * rate2
+        az[s] += prismatic * qdd
+        wz[s] += rate
+
+
+@njit(cache=True, inline="always")
+def _products(body, size):  # type: ignore[no-untyped-def]
+    wx, wy, wz = body[0], body[1], body[2]
+    xx, yy, zz, xy, xz, yz = body[9], body[10], body[11], body[12], body[13], body[14]
+    for s in range(size):
+        b0, b1, b2 = wx[s], wy[s], wz[s]
+        xx[s], yy[s], zz[s] = b0 * b0, b1 * b1, b2 * b2
+        xy[s], xz[s], yz[s] = b0 * b1, b0 * b2, b1 * b2
 
 
 @njit(cache=True, inline="always")
@@ -357,23 +369,71 @@ def mass_matrix(chain: Chain, q: ArrayLike, inertial: ArrayLike) -> Floats:
     zero = np.zeros_like(position)
     bodies = np.ascontiguousarray(inertial, dtype=np.float64)
     check_states(chain, position, zero, zero)
-    matrix = np.empty((len(position), chain.n, chain.n))
+    matrix, at = np.empty((len(position), chain.n, chain.n)), frames(chain, position)
     for j in range(chain.n):
         unit = zero.copy()
         unit[:, j] = 1.0
-        matrix[:, :, j] = _rnea(position, zero, unit, bodies, chain, np.zeros(3))
+        matrix[:, :, j] = _in_frames(at, zero, unit, bodies, chain, np.zeros(3))
     return matrix
 
 
 def _rnea(q: Floats, qd: Floats, qdd: Floats, bodies: Floats, chain: Chain, gravity: Floats) -> Floats:
-    cosine, sine = chain.cos_sin_alpha
-    angle = np.where(chain.prismatic, 0.0, q) + chain.theta
-    offset = np.where(chain.prismatic, q, 0.0) + chain.r
-    out = np.empty(q.shape)
+    return _in_frames(frames(chain, q), qd, qdd, bodies, chain, gravity)
+
+
+Frames = tuple[Floats, Floats, Floats]
+"""Cosine and sine of the joint angles, and offsets along the joint axes, (N, n) each."""
+
+
+def frames(chain: Chain, q: Floats) -> Frames:
+    """The joints' frames at positions q (N, n), to reuse in several torques."""
+    found = np.empty((3, *q.shape))
+    _frames(_fixed(q), chain.theta, chain.r, chain.prismatic, found)
+    return found[0], found[1], found[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _frames(q, theta, r, prismatic, out):  # type: ignore[no-untyped-def]
+    samples, n = q.shape
+    block = min(_BLOCK, samples)
+    angle, cosine, sine = np.empty(block), np.empty(block), np.empty(block)
+    for start in range(0, samples, _BLOCK):
+        size = min(_BLOCK, samples - start)
+        for k in range(n):
+            for s in range(size):
+                position = q[start + s, k]
+                angle[s] = theta[k] + (0.0 if prismatic[k] else position)
+                out[2, start + s, k] = r[k] + (position if prismatic[k] else 0.0)
+            _cos_sin(angle, cosine, sine, size)
+            for s in range(size):
+                out[0, start + s, k] = cosine[s]
+                out[1, start + s, k] = sine[s]
+
+
+def moved_frames(chain: Chain, at: Frames, q: Floats, joint: int) -> Frames:
+    """The same frames with one joint at q (N,)."""
+    cosine, sine, offset = at
+    if chain.prismatic[joint]:
+        offset = offset.copy()
+        offset[:, joint] = q + chain.r[joint]
+        return cosine, sine, offset
+    cosine, sine, angle = cosine.copy(), sine.copy(), q + chain.theta[joint]
+    cosine[:, joint], sine[:, joint] = np.cos(angle), np.sin(angle)
+    return cosine, sine, offset
+
+
+def torque_in(chain: Chain, at: Frames, qd: Floats, qdd: Floats, inertial: Floats) -> Floats:
+    """`torque` (N, n) in known frames, without checks."""
+    return _in_frames(at, qd, qdd, inertial, chain, chain.gravity)
+
+
+def _in_frames(at: Frames, qd: Floats, qdd: Floats, bodies: Floats, chain: Chain, gravity: Floats) -> Floats:
+    (cosine, sine), (ct, st, rr) = chain.cos_sin_alpha, at
+    out = np.empty(ct.shape)
     _newton_euler(
-        np.cos(angle),
-        np.sin(angle),
-        offset,
+        ct,
+        st,
+        rr,
         _fixed(qd),
         _fixed(qdd),
         cosine,
@@ -390,60 +450,80 @@ def _rnea(q: Floats, qd: Floats, qdd: Floats, bodies: Floats, chain: Chain, grav
 @njit(cache=True, error_model="numpy", nogil=True)
 def _newton_euler(ct, st, rr, qd, qdd, ca, sa, d, prismatic, gravity, bodies, out):  # type: ignore[no-untyped-def]
     samples, n = ct.shape
-    force = np.empty((n, 6))
-    for s in range(samples):
-        w0, w1, w2, e0, e1, e2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        a0, a1, a2 = -gravity[0], -gravity[1], -gravity[2]
+    block = min(_BLOCK, samples)
+    # As in `_fill`; cos and sin of theta, r, qd, qdd of each joint; force and moment of each link.
+    body, joint, force = np.zeros((9, block)), np.zeros((n, 5, block)), np.zeros((n, 6, block))
+    for start in range(0, samples, _BLOCK):
+        size = min(_BLOCK, samples - start)
+        for s in range(size):
+            for i in range(6):
+                body[i, s] = 0.0
+            body[6, s] = -gravity[0]
+            body[7, s] = -gravity[1]
+            body[8, s] = -gravity[2]
         for k in range(n):
-            px, py, pz = d[k], -sa[k] * rr[s, k], ca[k] * rr[s, k]
-            u0, u1, u2 = w1 * pz - w2 * py, w2 * px - w0 * pz, w0 * py - w1 * px
-            a0, a1, a2 = (
-                a0 + e1 * pz - e2 * py + w1 * u2 - w2 * u1,
-                a1 + e2 * px - e0 * pz + w2 * u0 - w0 * u2,
-                a2 + e0 * py - e1 * px + w0 * u1 - w1 * u0,
-            )
-            c, sn = ct[s, k], st[s, k]
-            t1, t2 = ca[k] * w1 + sa[k] * w2, ca[k] * w2 - sa[k] * w1
-            w0, w1, w2 = c * w0 + sn * t1, c * t1 - sn * w0, t2
-            t1, t2 = ca[k] * e1 + sa[k] * e2, ca[k] * e2 - sa[k] * e1
-            e0, e1, e2 = c * e0 + sn * t1, c * t1 - sn * e0, t2
-            t1, t2 = ca[k] * a1 + sa[k] * a2, ca[k] * a2 - sa[k] * a1
-            a0, a1, a2 = c * a0 + sn * t1, c * t1 - sn * a0, t2
-            rate = qd[s, k]
-            if prismatic[k]:
-                a0, a1, a2 = a0 + 2.0 * w1 * rate, a1 - 2.0 * w0 * rate, a2 + qdd[s, k]
-            else:
-                e0, e1, e2 = e0 + w1 * rate, e1 - w0 * rate, e2 + qdd[s, k]
-                w2 += rate
-            xx, xy, xz = bodies[k, 0], bodies[k, 1], bodies[k, 2]
-            yy, yz, zz = bodies[k, 3], bodies[k, 4], bodies[k, 5]
-            h0, h1, h2, m = bodies[k, 6], bodies[k, 7], bodies[k, 8], bodies[k, 9]
-            # omega x h, then f = m a + alpha x h + omega x (omega x h)
-            g0, g1, g2 = w1 * h2 - w2 * h1, w2 * h0 - w0 * h2, w0 * h1 - w1 * h0
-            force[k, 0] = m * a0 + e1 * h2 - e2 * h1 + w1 * g2 - w2 * g1
-            force[k, 1] = m * a1 + e2 * h0 - e0 * h2 + w2 * g0 - w0 * g2
-            force[k, 2] = m * a2 + e0 * h1 - e1 * h0 + w0 * g1 - w1 * g0
-            l0, l1, l2 = xx * w0 + xy * w1 + xz * w2, xy * w0 + yy * w1 + yz * w2, xz * w0 + yz * w1 + zz * w2
-            force[k, 3] = xx * e0 + xy * e1 + xz * e2 + w1 * l2 - w2 * l1 + h1 * a2 - h2 * a1
-            force[k, 4] = xy * e0 + yy * e1 + yz * e2 + w2 * l0 - w0 * l2 + h2 * a0 - h0 * a2
-            force[k, 5] = xz * e0 + yz * e1 + zz * e2 + w0 * l1 - w1 * l0 + h0 * a1 - h1 * a0
+            for s in range(size):
+                joint[k, 0, s] = ct[start + s, k]
+                joint[k, 1, s] = st[start + s, k]
+                joint[k, 2, s] = rr[start + s, k]
+                joint[k, 3, s] = qd[start + s, k]
+                joint[k, 4, s] = qdd[start + s, k]
+            _advance(body, joint[k], ca[k], sa[k], d[k], 1.0 if prismatic[k] else 0.0, size)
+            _load_of_link(body, bodies[k], force[k], size)
         for k in range(n - 1, -1, -1):
-            out[s, k] = force[k, 2] if prismatic[k] else force[k, 5]
-            if k == 0:
-                break
-            c, sn = ct[s, k], st[s, k]
-            # from frame k to frame k-1: Rz(theta) then Rx(alpha), moment about the origin of k-1
-            f0, t1 = c * force[k, 0] - sn * force[k, 1], sn * force[k, 0] + c * force[k, 1]
-            f1, f2 = ca[k] * t1 - sa[k] * force[k, 2], sa[k] * t1 + ca[k] * force[k, 2]
-            m0, t1 = c * force[k, 3] - sn * force[k, 4], sn * force[k, 3] + c * force[k, 4]
-            m1, m2 = ca[k] * t1 - sa[k] * force[k, 5], sa[k] * t1 + ca[k] * force[k, 5]
-            px, py, pz = d[k], -sa[k] * rr[s, k], ca[k] * rr[s, k]
-            force[k - 1, 0] += f0
-            force[k - 1, 1] += f1
-            force[k - 1, 2] += f2
-            force[k - 1, 3] += m0 + py * f2 - pz * f1
-            force[k - 1, 4] += m1 + pz * f0 - px * f2
-            force[k - 1, 5] += m2 + px * f1 - py * f0
+            own = force[k, 2] if prismatic[k] else force[k, 5]
+            for s in range(size):
+                out[start + s, k] = own[s]
+            if k > 0:
+                _carry_down(force[k], joint[k], ca[k], sa[k], d[k], force[k - 1], size)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _load_of_link(body, of_link, force, size):  # type: ignore[no-untyped-def]
+    """Force and moment (6, s) that move a link with the inertial parameters (10,)."""
+    wx, wy, wz = body[0], body[1], body[2]
+    ex, ey, ez = body[3], body[4], body[5]
+    ax, ay, az = body[6], body[7], body[8]
+    ixx, ixy, ixz, iyy, iyz, izz = of_link[0], of_link[1], of_link[2], of_link[3], of_link[4], of_link[5]
+    h0, h1, h2, m = of_link[6], of_link[7], of_link[8], of_link[9]
+    f0, f1, f2, m0, m1, m2 = force[0], force[1], force[2], force[3], force[4], force[5]
+    for s in range(size):
+        w0, w1, w2 = wx[s], wy[s], wz[s]
+        e0, e1, e2 = ex[s], ey[s], ez[s]
+        a0, a1, a2 = ax[s], ay[s], az[s]
+        # omega x h, then f = m a + alpha x h + omega x (omega x h)
+        g0, g1, g2 = w1 * h2 - w2 * h1, w2 * h0 - w0 * h2, w0 * h1 - w1 * h0
+        f0[s] = m * a0 + e1 * h2 - e2 * h1 + w1 * g2 - w2 * g1
+        f1[s] = m * a1 + e2 * h0 - e0 * h2 + w2 * g0 - w0 * g2
+        f2[s] = m * a2 + e0 * h1 - e1 * h0 + w0 * g1 - w1 * g0
+        l0 = ixx * w0 + ixy * w1 + ixz * w2
+        l1 = ixy * w0 + iyy * w1 + iyz * w2
+        l2 = ixz * w0 + iyz * w1 + izz * w2
+        m0[s] = ixx * e0 + ixy * e1 + ixz * e2 + w1 * l2 - w2 * l1 + h1 * a2 - h2 * a1
+        m1[s] = ixy * e0 + iyy * e1 + iyz * e2 + w2 * l0 - w0 * l2 + h2 * a0 - h0 * a2
+        m2[s] = ixz * e0 + iyz * e1 + izz * e2 + w0 * l1 - w1 * l0 + h0 * a1 - h1 * a0
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _carry_down(force, joint, ca, sa, d, below, size):  # type: ignore[no-untyped-def]
+    """Add force and moment (6, s) of a link to those of the link before it."""
+    c, sn, r = joint[0], joint[1], joint[2]
+    f0, f1, f2, m0, m1, m2 = force[0], force[1], force[2], force[3], force[4], force[5]
+    b0, b1, b2, b3, b4, b5 = below[0], below[1], below[2], below[3], below[4], below[5]
+    for s in range(size):
+        # from frame k to frame k-1: Rz(theta) then Rx(alpha), moment about the origin of k-1
+        cs, ss = c[s], sn[s]
+        g0, t1, t2 = cs * f0[s] - ss * f1[s], ss * f0[s] + cs * f1[s], f2[s]
+        g1, g2 = ca * t1 - sa * t2, sa * t1 + ca * t2
+        n0, t1, t2 = cs * m0[s] - ss * m1[s], ss * m0[s] + cs * m1[s], m2[s]
+        n1, n2 = ca * t1 - sa * t2, sa * t1 + ca * t2
+        px, py, pz = d, -sa * r[s], ca * r[s]
+        b0[s] += g0
+        b1[s] += g1
+        b2[s] += g2
+        b3[s] += n0 + py * g2 - pz * g1
+        b4[s] += n1 + pz * g0 - px * g2
+        b5[s] += n2 + px * g1 - py * g0
 
 
 @njit(cache=True, error_model="numpy")
@@ -452,14 +532,9 @@ def _torque_at(q, qd, qdd, table, gravity, bodies, out):  # type: ignore[no-unty
     n = q.shape[0]
     if not np.isfinite(q.sum() + qd.sum() + qdd.sum()):
         return False
-    prismatic = table[5]
+    turned = table[5] > 0.0
     motion = np.empty((3, 1, n))
-    for k in range(n):
-        angle = table[3, k] + (1.0 - prismatic[k]) * q[k]
-        motion[0, 0, k] = np.cos(angle)
-        motion[1, 0, k] = np.sin(angle)
-        motion[2, 0, k] = table[4, k] + prismatic[k] * q[k]
-    turned = prismatic > 0.0
+    _frames(q.reshape(1, n), table[3], table[4], turned, motion)
     ca, sa, d = table[0], table[1], table[2]
     states = qd.reshape(1, n), qdd.reshape(1, n)
     _newton_euler(

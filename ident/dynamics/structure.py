@@ -111,6 +111,11 @@ class Condition:
     sides: tuple[Side, ...] | None = None
 
 
+_Plan = tuple[dict[int, tuple[int, int]], list[tuple[int, int, int, int, bool]]]
+"""Sources (link, inertial position) of rigid columns; and column, side, joint, atom of the other entries, and whether
+they belong to the link."""
+
+
 @dataclass(frozen=True, eq=False)
 class ModelStructure:
     """Columns and rows of a linear torque model for a chain.
@@ -278,6 +283,30 @@ class ModelStructure:
 
     # ---- the stacked matrix ----
 
+    @cached_property
+    def _plans(self) -> dict[tuple[bytes, str | None, tuple[Side, ...]], _Plan]:
+        return {}
+
+    def _plan(self, wanted: bytes, payload: str | None, sides: tuple[Side, ...]) -> _Plan:
+        """Where the entries of a matrix of the columns `wanted` (int64) come from, found once."""
+        key = wanted, payload, sides
+        if key not in self._plans:
+            columns = np.frombuffer(wanted, dtype=np.int64).tolist()
+            rigid = {c: self.rigid_of(column, payload) for c, column in enumerate(columns)}
+            entries = []
+            for c, column in enumerate(columns):
+                link, place = divmod(column, len(PER_LINK))
+                if link < self.n_links and place < len(INERTIAL):
+                    continue
+                of_link = link < self.n_links and PER_LINK[place] in _JOINT_TERMS
+                for s, side in enumerate(sides):
+                    for joint in range(self.chain.n):
+                        atom = self.signal_of(column, side, joint)
+                        if atom is not None:
+                            entries.append((c, s, joint, atom, of_link))
+            self._plans[key] = {c: source for c, source in rigid.items() if source is not None}, entries
+        return self._plans[key]
+
     def regressor(
         self,
         q: ArrayLike,
@@ -303,8 +332,7 @@ class ModelStructure:
             raise ConfigurationError(f"columns must be a list of indices below {self.n_columns}")
         n, samples = self.chain.n, len(position)
         out = np.zeros((len(wanted), len(chosen), n, samples))
-        rigid = {c: self.rigid_of(int(column), payload) for c, column in enumerate(wanted)}
-        sources = {c: source for c, source in rigid.items() if source is not None}
+        sources, entries = self._plan(wanted.tobytes(), payload, chosen)
         # Difference rows have no rigid part and are never preceded by other sides (side order).
         rigid_sides = [s for s, side in enumerate(chosen) if side != "difference"]
         if rigid_sides:
@@ -324,15 +352,6 @@ class ModelStructure:
         if drive is not None:
             moved = np.empty_like(signals)
             self.signals(drive.speed, drive.acceleration, moved, drive.slip)
-        for c, column in enumerate(wanted):
-            link, place = divmod(column, len(PER_LINK))
-            if link < self.n_links and place < len(INERTIAL):
-                continue
-            of_link = link < self.n_links and PER_LINK[place] in _JOINT_TERMS
-            atoms = signals if of_link else moved
-            for s, side in enumerate(chosen):
-                for joint in range(n):
-                    atom = self.signal_of(column, side, joint)
-                    if atom is not None:
-                        out[c, s, joint] = atoms[atom, joint]
+        for c, side_number, joint, atom, of_link in entries:
+            out[c, side_number, joint] = (signals if of_link else moved)[atom, joint]
         return out.reshape(len(wanted), -1).T

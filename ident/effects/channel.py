@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -110,9 +110,11 @@ class SensorHysteresis(Effect):
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Minus Dahl's state along the predicted torque."""
-        return (
-            Column(joint=-dahl(np.ascontiguousarray(motion.joint_torque[:, joint]), shape["width"], 0.0)),
-        )
+
+        def lag(whole: ArmMotion) -> Floats:
+            return -dahl(np.ascontiguousarray(whole.joint_torque[:, joint]), shape["width"], 0.0)
+
+        return (Column(joint=motion.along(lag, "lag", joint, shape["width"])),)
 
     def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Delays the reported joint torque."""
@@ -284,10 +286,11 @@ class _Delay(Effect):
         """From a millisecond to thirty, late and early."""
         return [Shape(delay=sign * delay) for delay in self.grid_s for sign in (1.0, -1.0)]
 
-    def late(self, motion: ArmMotion, torque: Floats, delay: float) -> Floats:
+    def late(self, motion: ArmMotion, torque: Callable[[ArmMotion], Floats], delay: float) -> Floats:
         """Torque (N, n) of `delay` before, minus that of now."""
-        before = motion.time - delay
-        return np.column_stack([np.interp(before, motion.time, column) for column in torque.T]) - torque
+        before, around = motion.time - delay, motion.around(delay)
+        earlier = [np.interp(before, around.time, column) for column in torque(around).T]
+        return np.column_stack(earlier) - torque(motion)
 
     def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Reports old joint torques."""
@@ -328,7 +331,11 @@ class MotorTorqueDelay(_Delay):
         Coulomb friction is in it for a delay longer than the friction's reversal. A shorter delay looks like another
         presliding length there.
         """
-        torque = motion.motor_torque if abs(shape["delay"]) > _TURN_S else motion.smooth_torque("motor")
+        with_jumps = abs(shape["delay"]) > _TURN_S
+
+        def torque(one: ArmMotion) -> Floats:
+            return one.motor_torque if with_jumps else one.smooth_torque("motor")
+
         return (Column(motor=self.late(motion, torque, shape["delay"])),)
 
 
@@ -344,7 +351,7 @@ class JointTorqueDelay(_Delay):
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Earlier minus present predicted torque without the jumps at reversals, in all joint rows."""
-        return (Column(joint=self.late(motion, motion.smooth_torque("joint"), shape["delay"])),)
+        return (Column(joint=self.late(motion, lambda one: one.smooth_torque("joint"), shape["delay"])),)
 
 
 class LostSamples(Effect):

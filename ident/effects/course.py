@@ -87,19 +87,11 @@ class Drifting(Effect):
 
     def course(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Floats, ...]:
         """Factor (N,) of each coefficient."""
+        constant = shape.get("time_constant", 0.0)
         if shape.form is Course.HEATED:
-            return (_warmth(motion, joint, shape["time_constant"], 0.0),)
+            return (motion.along(lambda m: _warmth(m, joint, constant, 0.0), "heated", joint, constant),)
         if shape.form is Course.CARRIED:
-            past: list[ArmMotion] = [motion]
-            while past[-1].earlier is not None:
-                past.append(past[-1].earlier)
-            start, end_s, found = 0.0, past[-1].begun_s, np.zeros(0)
-            for one in reversed(past):
-                pause = max(0.0, one.begun_s + float(one.time[0]) - end_s)
-                start *= float(np.exp(-pause / shape["time_constant"]))
-                found = _warmth(one, joint, shape["time_constant"], start)
-                start, end_s = float(found[-1]), one.begun_s + float(one.time[-1])
-            return (found,)
+            return (motion.along(lambda m: _carried(m, joint, constant), "carried", joint, constant),)
         if shape.form is Course.WITHIN:
             return (1.0 - np.exp(-motion.time / shape["time_constant"]),)
         whole = np.ones(len(motion.time))
@@ -135,9 +127,23 @@ class Drifting(Effect):
         return [f"{size} {when}, with a time constant of {quantity(values['time_constant'])}"]
 
 
+def _carried(motion: ArmMotion, joint: int, time_constant: float) -> Floats:
+    """Warmth (N,) of a drive with the heat left over from the motions before."""
+    past: list[ArmMotion] = [motion]
+    while past[-1].earlier is not None:
+        past.append(past[-1].earlier)
+    start, end_s, found = 0.0, past[-1].begun_s, np.zeros(0)
+    for one in reversed(past):
+        pause = max(0.0, one.begun_s + float(one.time[0]) - end_s)
+        start *= float(np.exp(-pause / time_constant))
+        found = _warmth(one, joint, time_constant, start)
+        start, end_s = float(found[-1]), one.begun_s + float(one.time[-1])
+    return found
+
+
 def _warmth(motion: ArmMotion, joint: int, time_constant: float, start: float) -> Floats:
     """Warmth (N,) of a drive by the power of its friction, over that at 1 rad/s, from `start` on."""
-    power = np.ascontiguousarray(motion.drive_friction[:, joint] * motion.motor_speed[:, joint])
     usual = max(float(motion.friction(np.ones((1, motion.n)))[0, joint]), 1e-9)
-    warmth: Floats = first_order(power / usual, np.exp(-motion.dt / time_constant), start)
+    power = motion.friction_power(joint) / usual
+    warmth: Floats = first_order(power, np.exp(-motion.dt / time_constant), start)
     return warmth

@@ -74,11 +74,15 @@ class PreslidingHysteresis(Effect):
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Dahl's state, or the hyperbolic tangent of the speed, less sign(v) in the motor torque."""
-        speed = motion.motor_speed[:, joint]
         if shape.form is _Turning.SMOOTH:
+            speed = motion.motor_speed[:, joint]
             return (Column(motor=np.tanh(speed / shape["velocity"]) - motion.direction[:, joint]),)
-        path = np.cumsum(speed) * motion.dt
-        state = dahl(path, shape["length"], float(np.sign(speed[0])))
+
+        def turning(whole: ArmMotion) -> Floats:
+            speed = whole.motor_speed[:, joint]
+            return np.asarray(dahl(np.cumsum(speed) * whole.dt, shape["length"], float(np.sign(speed[0]))))
+
+        state = motion.along(turning, "turning", joint, shape["length"])
         return (Column(motor=state - motion.direction[:, joint]),)
 
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:

@@ -316,6 +316,12 @@ class Effect(ABC):
         return ()
 
     @property
+    def seen_by(self) -> tuple[str, ...]:
+        """Sides with a torque of its columns."""
+        own = {"motor": ("motor",), "sensor": ("joint",)}
+        return (self.channel,) if self.channel is not None else own.get(self.side, ("motor", "joint"))
+
+    @property
     def repeats(self) -> bool:
         """Whether it may be claimed several times, like a contact and unlike a lasting change."""
         return self.event and not self.step

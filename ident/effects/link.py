@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,10 +27,12 @@ from ident.effects.effect import (
 from ident.effects.motion import ArmMotion, Floats, dahl
 from ident.effects.springs import Springs
 from ident.effects.words import Values, one_joint, quantity, quantity_text, times, wave
-from ident.rows.filters import differentiate, low_pass
+from ident.rows.filters import differentiate, low_pass, settling
 
 # Cut-off of a twist before it is differentiated, with the link and with the motor displaced [Hz].
 _LINK_HZ, _MOTOR_HZ = 8.0, 30.0
+# Samples in reach of a derivative.
+_REACH = 4
 
 
 class _Encoder(Form):
@@ -122,8 +124,9 @@ class JointElasticity(_Twisting):
         """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
         if motion.springs is not None and shape.form is _Encoder.MOTOR:
             size = shape.get("size", _SMALL)
-            return _changed_springs(motion.springs, motion.springs.softer(joint, size), size)
-        return _deflected(motion, joint, motion.joint_torque[:, joint], shape.form is _Encoder.MOTOR, 1e-5)
+            return _changed_springs(motion, motion.springs.softer(joint, size), size, ("softer", joint, size))
+        at_motor = shape.form is _Encoder.MOTOR
+        return _deflected(motion, joint, lambda torque: torque, at_motor, 1e-5)
 
     def twist(self, torque: Any, parameters: Parameters) -> Any:
         """In proportion to the torque."""
@@ -180,9 +183,15 @@ class Backlash(_Twisting):
         """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
         size = shape.get("size", 0.0)
         if motion.springs is not None and size > 0.0 and shape.form is _Encoder.MOTOR:
-            return _changed_springs(motion.springs, motion.springs.with_play(joint, size), size)
-        half = 0.5 * np.tanh(motion.joint_torque[:, joint] / shape["width"])
-        return _deflected(motion, joint, half, shape.form is _Encoder.MOTOR, 1e-3)
+            return _changed_springs(
+                motion, motion.springs.with_play(joint, size), size, ("play", joint, size)
+            )
+
+        def half(torque: Floats) -> Floats:
+            return np.asarray(0.5 * np.tanh(torque / shape["width"]))
+
+        at_motor = shape.form is _Encoder.MOTOR
+        return _deflected(motion, joint, half, at_motor, 1e-3)
 
     def twist(self, torque: Any, parameters: Parameters) -> Any:
         """Half the gap to the side of the torque."""
@@ -190,24 +199,30 @@ class Backlash(_Twisting):
 
 
 def _deflected(
-    motion: ArmMotion, joint: int, twist: Floats, encoder_at_motor: bool, scale: float
+    motion: ArmMotion,
+    joint: int,
+    twist: Callable[[Floats], Floats],
+    encoder_at_motor: bool,
+    scale: float,
 ) -> tuple[Column, ...]:
-    """Column for a twist (N,) of the joint, motor minus link, by a unit coefficient [rad].
+    """Column for a twist of the joint, motor minus link, by a unit coefficient [rad].
 
     With the encoder at the motor the link stands at q - twist, and all torques change. With the encoder at the link
-    the motor moves by the twist beside it: drive inertia and drive friction see its derivatives. scale : coefficient
-    of the linearisation. The links are taken to follow at once.
+    the motor moves by the twist beside it: drive inertia and drive friction see its derivatives. twist : as a function
+    of the joint torque (N,). scale : coefficient of the linearisation. The links are taken to
+    follow at once.
     """
-    dt = motion.dt
     # Two derivatives amplify the noisy acceleration part of the torque, with the link's inertia as a factor more than
     # with the drive's friction.
-    cutoff = min(_LINK_HZ if encoder_at_motor else _MOTOR_HZ, 0.2 / dt)
-    twist = low_pass(twist[:, None], dt, cutoff)
-    first, second = differentiate(twist, dt)
+    cutoff = min(_LINK_HZ if encoder_at_motor else _MOTOR_HZ, 0.2 / motion.dt)
+
+    def turned(around: ArmMotion) -> Floats:
+        smooth = low_pass(twist(around.joint_torque[:, joint])[:, None], around.dt, cutoff)
+        return np.hstack([smooth, *differentiate(smooth, around.dt)])
+
+    turn, first, second = motion.beside(settling(cutoff) + _REACH * motion.dt, turned).T
     if encoder_at_motor:
-        shifts = (_alone(motion, joint, -scale * part[:, 0]) for part in (twist, first, second))
-        return (both_sides(motion.displaced(*shifts) / scale),)
-    first, second = first[:, 0], second[:, 0]
+        return (both_sides(motion.displaced(joint, -scale * turn, -scale * first, -scale * second) / scale),)
     # Without the jump of Coulomb friction: it moves by a millisecond or so, and would give a column of spikes.
     here, there = motion.motor_speed, motion.motor_speed.copy()
     there[:, joint] += scale * first
@@ -217,20 +232,20 @@ def _deflected(
     return (Column(motor=motion.inertia[joint] * second + friction),)
 
 
-def _alone(motion: ArmMotion, joint: int, values: Floats) -> Floats:
-    """Values (N,) of a joint as (N, n), zero for the others."""
-    shift = np.zeros_like(motion.q)
-    shift[:, joint] = values
-    return shift
-
-
-def _changed_springs(springs: Springs, changed: Springs, size: float) -> tuple[Column, ...]:
-    """Column of a change of the springs behind the published motors, over its `size`.
+def _changed_springs(
+    motion: ArmMotion, changed: Springs, size: float, key: tuple[Hashable, ...]
+) -> tuple[Column, ...]:
+    """Column of a change of the springs behind the published motors, over its `size`; remembered by `key`.
 
     The links ring on their springs, which is not proportional to the size. The column belongs to one size, and its
     coefficient equals that size for the right one.
     """
-    return (both_sides((changed.torque - springs.torque) / size),)
+
+    def torque(whole: ArmMotion) -> Floats:
+        assert whole.springs is not None
+        return (changed.torque - whole.springs.torque) / size
+
+    return (both_sides(motion.along(torque, *key)),)
 
 
 class _Spring(Form):
@@ -319,7 +334,11 @@ class CableSpring(Effect):
 
     def companions(self, motion: ArmMotion, joint: int, setting: Setting) -> tuple[Column, ...]:
         """A hose rubs along the arm: Dahl's friction along the angle."""
-        return (both_sides(dahl(np.ascontiguousarray(motion.q[:, joint]), _RUB_RAD, 0.0)),)
+
+        def rub(whole: ArmMotion) -> Floats:
+            return np.asarray(dahl(np.ascontiguousarray(whole.q[:, joint]), _RUB_RAD, 0.0))
+
+        return (both_sides(motion.along(rub, "rub", joint)),)
 
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """A torque on the link, or on both."""
@@ -432,10 +451,9 @@ class JointZeroOffset(Effect):
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Derivative of the joint torque by the joint's position, in all rows."""
-        step = np.zeros_like(motion.q)
-        step[:, joint] = 1e-4
-        upper = motion.rigid_torque(motion.q + step, motion.qd, motion.qdd)
-        lower = motion.rigid_torque(motion.q - step, motion.qd, motion.qdd)
+        still = np.zeros(len(motion.q))
+        upper = motion.displaced(joint, still + 1e-4, still, still)
+        lower = motion.displaced(joint, still - 1e-4, still, still)
         return (both_sides((upper - lower) / 2e-4),)
 
     def same_as(self, setting: Setting, joint: int) -> str | None:
@@ -492,8 +510,8 @@ class EncoderEccentricity(Effect):
         # Error e(q), its slope e' and curvature e'': the rate is e' qd, the acceleration e'' qd^2 + e' qdd.
         for error, slope, curvature in ((cos, -k * sin, -(k**2) * cos), (sin, k * cos, -(k**2) * sin)):
             moved = (error, slope * qd, curvature * qd**2 + slope * qdd)
-            shifts = (_alone(motion, joint, -_STEP_RAD * part) for part in moved)
-            found.append(both_sides(motion.displaced(*shifts) / _STEP_RAD))
+            shifts = (-_STEP_RAD * part for part in moved)
+            found.append(both_sides(motion.displaced(joint, *shifts) / _STEP_RAD))
         return tuple(found)
 
     def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:

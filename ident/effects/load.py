@@ -39,7 +39,7 @@ def _body_torque(motion: ArmMotion, place: int) -> Floats:
     """Torque (N, n) of a unit of an inertial parameter in the last link's frame."""
     bodies = np.zeros_like(motion.bodies)
     bodies[-1, place] = 1.0
-    return motion.rigid_torque(motion.q, motion.qd, motion.qdd, bodies)
+    return motion.torque_of(bodies)
 
 
 class _Body(Simulated):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -13,8 +13,17 @@ from numpy.typing import NDArray
 from ident.dynamics import regressor
 from ident.dynamics.kinematics import Chain
 from ident.effects.springs import Springs
+from lwr_driver.session.spool import spans
 
 Floats = NDArray[np.float64]
+Picked = slice | NDArray[np.int64]
+"""Samples of a motion."""
+
+_BY_SAMPLE = (
+    "time", "q", "qd", "qdd", "motor_speed", "motor_acceleration", "joint_torque", "motor_torque",
+)  # fmt: skip
+# Values along a whole motion remembered for its parts.
+_KEPT = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +48,7 @@ class ArmMotion:
     loaded : whether the payload is attached.
     begun_s : beginning of the session [s] by a clock of all sessions. earlier : the motion before it by that clock, of
         this session or of another one; None for the first.
+    whole, picked : of a part, the motion it is from and its samples there; None for a whole motion.
     """
 
     chain: Chain
@@ -63,6 +73,8 @@ class ArmMotion:
     loaded: bool = True
     begun_s: float = 0.0
     earlier: ArmMotion | None = None
+    whole: ArmMotion | None = None
+    picked: Picked | None = None
 
     @property
     def n(self) -> int:
@@ -71,29 +83,95 @@ class ArmMotion:
 
     @property
     def dt(self) -> float:
-        """Time between samples [s]."""
-        return float(self.time[1] - self.time[0]) if len(self.time) > 1 else 1e-3
+        """Time between samples [s], of the whole motion."""
+        time = self.time if self.whole is None else self.whole.time
+        return float(time[1] - time[0]) if len(time) > 1 else 1e-3
+
+    def part(self, picked: Picked) -> ArmMotion:
+        """Some samples of this motion. Operators with memory go along the whole one: see `along`."""
+        found = {name: getattr(self, name)[picked] for name in _BY_SAMPLE}
+        slip = None if self.slip is None else self.slip[picked]
+        return replace(self, **found, slip=slip, whole=self, picked=picked)
+
+    def along(self, made: Callable[[ArmMotion], Floats], *key: Hashable) -> Floats:
+        """Values (N, ...) of an operator with memory: made on the whole motion, picked for a part.
+
+        key : name and parameters; the whole motion remembers the last few values for its next part.
+        """
+        if self.whole is None or self.picked is None:
+            return made(self)
+        return self.whole._remembered(made, key)[self.picked]
+
+    def _remembered(self, made: Callable[[ArmMotion], Floats], key: tuple[Hashable, ...]) -> Floats:
+        found = self._kept.get(key)
+        if found is None:
+            found = made(self)
+            # Threads may forget what another one has just made: it is made again, nothing else.
+            for old in list(self._kept)[: len(self._kept) + 1 - _KEPT]:
+                self._kept.pop(old, None)
+            self._kept[key] = found
+        return found
+
+    def around(self, seconds: float) -> ArmMotion:
+        """The uninterrupted motion from the first to the last sample of a part, and `seconds` to either side."""
+        if self.whole is None:
+            return self
+        more = int(np.ceil(abs(seconds) / self.dt)) + 2
+        first, last = np.searchsorted(self.whole.time, self.time[[0, -1]])
+        return self.whole.part(slice(max(int(first) - more, 0), int(last) + more + 1))
+
+    def beside(self, seconds: float, made: Callable[[ArmMotion], Floats]) -> Floats:
+        """Values (N, ...) of an operator that reaches `seconds` to either side, for a part made from its
+        surroundings."""
+        around = self.around(seconds)
+        values = made(around)
+        if around is self or not isinstance(around.picked, slice):
+            return values
+        first, own = around.picked.start, self.picked
+        return values[slice(own.start - first, own.stop - first) if isinstance(own, slice) else own - first]
+
+    @cached_property
+    def _kept(self) -> dict[tuple[Hashable, ...], Floats]:
+        return {}
 
     @property
     def direction(self) -> Floats:
         """(N, n) `slip`, or the sign of the motors' speed."""
         return np.sign(self.motor_speed) if self.slip is None else self.slip
 
-    @property
+    @cached_property
     def drive_friction(self) -> Floats:
         """Friction (N, n) of the drives [Nm]."""
         return self.friction(self.motor_speed) + self.motor_coulomb * (
             self.direction - np.sign(self.motor_speed)
         )
 
+    def friction_power(self, joint: int) -> Floats:
+        """Power (N,) [W] of the friction of a drive."""
+
+        def power(whole: ArmMotion) -> Floats:
+            parts = (whole.part(some) for some in spans(len(whole.time), 2**14))
+            return np.concatenate([one.drive_friction[:, joint] * one.motor_speed[:, joint] for one in parts])
+
+        return self._remembered(power, ("power", joint))
+
     def rigid_torque(self, q: Floats, qd: Floats, qdd: Floats, bodies: Floats | None = None) -> Floats:
         """Rigid inverse dynamics (N, n) [Nm] of the links with the payload, or of other `bodies` (n, 10)."""
         return regressor.torque(self.chain, q, qd, qdd, self.bodies if bodies is None else bodies)
 
     @cached_property
+    def frames(self) -> regressor.Frames:
+        """The joints' frames along the motion, computed once."""
+        return regressor.frames(self.chain, self.q)
+
+    @cached_property
     def still_rigid(self) -> Floats:
         """`rigid_torque` (N, n) of the motion itself [Nm], computed once."""
-        return self.rigid_torque(self.q, self.qd, self.qdd)
+        return self.torque_of(self.bodies)
+
+    def torque_of(self, bodies: Floats) -> Floats:
+        """`rigid_torque` (N, n) [Nm] of the motion itself with other `bodies` (n, 10)."""
+        return regressor.torque_in(self.chain, self.frames, self.qd, self.qdd, bodies)
 
     def smooth_torque(self, side: str) -> Floats:
         """Predicted torque (N, n) of a side without the Coulomb friction and its jumps at reversals."""
@@ -107,13 +185,17 @@ class ArmMotion:
         tilted = replace(self.chain, gravity=9.81 * np.asarray(direction, dtype=np.float64))
         return regressor.gravity_torque(tilted, self.q, self.bodies)
 
-    def displaced(self, shift: Floats, rate: Floats, acceleration: Floats) -> Floats:
-        """Change (N, n) of the predicted joint torque [Nm] when the links are at q + shift.
+    def displaced(self, joint: int, shift: Floats, rate: Floats, acceleration: Floats) -> Floats:
+        """Change (N, n) of the predicted joint torque [Nm] when a link is at q + shift.
 
-        shift, rate, acceleration : (N, n) [rad, rad/s, rad/s^2].
+        shift, rate, acceleration : (N,) of the joint [rad, rad/s, rad/s^2].
         """
-        moved = self.rigid_torque(self.q + shift, self.qd + rate, self.qdd + acceleration)
-        return moved - self.still_rigid
+        at = regressor.moved_frames(self.chain, self.frames, self.q[:, joint] + shift, joint)
+        qd, qdd = self.qd.copy(), self.qdd.copy()
+        qd[:, joint] += rate
+        qdd[:, joint] += acceleration
+        moved = regressor.torque_in(self.chain, at, qd, qdd, self.bodies)
+        return np.subtract(moved, self.still_rigid, out=moved)
 
 
 def in_order(motions: Sequence[ArmMotion]) -> list[ArmMotion]:

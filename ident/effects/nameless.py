@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from numba import njit
 
 from fri.errors import ConfigurationError
 from ident.effects.effect import (
@@ -41,8 +42,17 @@ _FACTOR = re.compile(r"sign\(qd([1-9]\d*)\)|load([1-9]\d*)")
 
 def hats(values: Floats, low: float, high: float) -> Floats:
     """Piecewise linear functions (N, 7) of values (N,), with knots evenly from `low` to `high`, constant beyond."""
-    place = np.clip((values - low) / (high - low), 0.0, 1.0) * (KNOTS - 1)
-    return np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(KNOTS)))
+    found = np.zeros((len(values), KNOTS))
+    _add_hats(np.clip((values - low) / (high - low), 0.0, 1.0) * (KNOTS - 1), found)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _add_hats(place, out):  # type: ignore[no-untyped-def]
+    for k in range(len(place)):
+        knot = min(int(place[k]), KNOTS - 2)
+        out[k, knot] = 1.0 - (place[k] - knot)
+        out[k, knot + 1] = place[k] - knot
 
 
 class _Term(Simulated):

@@ -11,13 +11,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Coulomb, DriveMotion, ModelStructure, Side
 from ident.rows.prepare import PreparedSession, TorqueChannel
 
-_CHUNK = 2000
+_CHUNK = 1000
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def binned_regressor(
     """Regressor (n, m, C) of a motion in bins of `width` samples."""
     n, count = structure.chain.n, len(motion.q) // width * width
     size = max(width, _CHUNK // width * width)
-    parts = []
+    found = np.zeros((n, count // width, len(columns)))
     for first in range(0, count, size):
         some = slice(first, min(first + size, count))
         wide = structure.regressor(
@@ -84,9 +85,24 @@ def binned_regressor(
             columns=columns,
             drive=None if motion.drive is None else motion.drive.at(some),
         )
-        table = wide.T.reshape(len(columns), n, -1, width)
-        parts.append(table.mean(axis=3).transpose(1, 2, 0))
-    return np.concatenate(parts, axis=1) if parts else np.zeros((n, 0, len(columns)))
+        _add_means(wide.T.reshape(len(columns), n, -1), width, found[:, first // width :])
+    return found
+
+
+# The order of a sum is free, so that the compiler may vectorise it.
+@njit(cache=True, nogil=True, fastmath={"reassoc"})
+def _add_means(table, width, out):  # type: ignore[no-untyped-def]
+    """Add means over `width` samples of (C, n, N) to (n, >= N / width, C)."""
+    columns, joints, samples = table.shape
+    share = 1.0 / width
+    for j in range(joints):
+        for c in range(columns):
+            series = table[c, j]
+            for row in range(samples // width):
+                total = 0.0
+                for k in range(row * width, (row + 1) * width):
+                    total += series[k]
+                out[j, row, c] += share * total
 
 
 def observe_bins(

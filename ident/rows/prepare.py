@@ -39,6 +39,7 @@ from ident.rows.filters import (
 from ident.rows.reversals import away_from_reversals
 from ident.rows.sample_clock import sample_clock
 from ident.rows.timebase import (
+    Outliers,
     Stretch,
     flag_outliers,
     sample_period,
@@ -183,12 +184,14 @@ def prepare(
     log: bool = True,
     advise: bool = True,
     blocks: bool = False,
+    outliers: Outliers = flag_outliers,
 ) -> PreparedSession:
     """Filter and align one session.
 
     motor : False leaves the motor channel aside. log : False keeps warnings to itself. advise : False gives no advice
     on cut-offs, for those that the data chose. blocks : passages of two minutes at most, with samples beyond their
-    ends for the filters and kept in files, so that the memory does not grow with the session.
+    ends for the filters and kept in files, so that the memory does not grow with the session. outliers : finds them;
+    for one that remembers them from one call to the next.
 
     Raises DataError for too few samples, times that do not increase, non-finite values, no torque, no motion.
     """
@@ -211,10 +214,10 @@ def prepare(
     dt = sample_period(times, sequence, f"{name}: /joint_states")
     settings = (settings or SignalSettings()).settled(1.0 / dt)
     warnings: list[str] = []
-    position_flags, crowded = flag_outliers(position, settings.outlier_scale)
-    effort_flags, also = flag_outliers(effort, settings.outlier_scale)
+    position_flags, crowded = outliers(position, settings.outlier_scale)
+    effort_flags, also = outliers(effort, settings.outlier_scale)
     kept = held(effort, times, times, position) if sensed else np.zeros(len(times), dtype=bool)
-    effort_flags |= kept[:, None]
+    effort_flags = effort_flags | kept[:, None]
     warnings += _jumping(name, "position", session.joint_names, crowded)
     warnings += _jumping(name, "joint torque", session.joint_names, also)
     names = moving(position, session.joint_names)
@@ -246,7 +249,9 @@ def prepare(
     # A tenth of a gigabyte for an hour.
     del parts, longest, position_flags, effort_flags, old, kept, bad, times
     motor_data = (
-        _motor(session, origin, settings, name, warnings) if motor and session.motor is not None else None
+        _motor(session, origin, settings, name, warnings, outliers)
+        if motor and session.motor is not None
+        else None
     )
     if motor_data is not None and clock is not None:
         motor_data = (clock.at(motor_data[0], stamps), *motor_data[1:])
@@ -597,7 +602,12 @@ def _valid(channel: TorqueChannel, rows: Floats, settings: SignalSettings) -> Bo
 
 
 def _motor(
-    session: Session, origin: int, settings: SignalSettings, name: str, warnings: list[str]
+    session: Session,
+    origin: int,
+    settings: SignalSettings,
+    name: str,
+    warnings: list[str],
+    outliers: Outliers,
 ) -> tuple[Floats, Floats, BoolArray]:
     """Times (m,) [s] on the joint channel's clock, torques (m, J) and outlier flags (m, J) of the motor channel."""
     assert session.motor is not None
@@ -617,10 +627,10 @@ def _motor(
         )
     sample_period(times, None, f"{name}: /motor_states")
     effort = session.motor.effort
-    flags, crowded = flag_outliers(effort, settings.outlier_scale)
+    flags, crowded = outliers(effort, settings.outlier_scale)
     warnings += _jumping(name, "motor torque", session.joint_names, crowded)
     path_times = np.asarray((reference - origin) * 1e-9, dtype=np.float64)
-    flags |= held(effort, times, path_times, session.joint.position)[:, None]
+    flags = flags | held(effort, times, path_times, session.joint.position)[:, None]
     effort = effort.copy() if flags.any() else effort
     for joint in np.flatnonzero(flags.any(axis=0)):
         good = ~flags[:, joint]

@@ -32,6 +32,7 @@ from ident.rows.data_quality import passed_band
 from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass
 from ident.rows.prepare import prepare
 from ident.rows.reversals import away_from_reversals
+from ident.rows.timebase import KnownOutliers, Outliers
 from lwr_driver.session import Session
 
 logger = logging.getLogger(__name__)
@@ -84,14 +85,16 @@ def choose_signals(
     parts = [_excerpt(session, _MOST_S / len(sessions)) for session in sessions]
     rate = min(1.0 / session.joint.period_s for session in parts)
     reasons: list[str] = []
-    found, band = _with_decimation(settings, parts, rate, motor, reasons)
-    rough = [prepare(session, found, motor=motor, log=False) for session in parts]
+    outliers = KnownOutliers()
+    found, band = _with_decimation(settings, parts, rate, motor, reasons, outliers)
+    rough = [prepare(session, found, motor=motor, log=False, outliers=outliers) for session in parts]
     delays = [0.0 if one.delay is None else one.delay.seconds for one in rough]
     block_s = min(_BLOCK_S, min(session.duration_s for session in parts) / _LEAST_BLOCKS)
-    bench = _Bench(parts, payloads, structure, columns, motor, delays, band, block_s)
+    bench = _Bench(parts, payloads, structure, columns, motor, delays, band, block_s, outliers)
+    rows: _ByClass | None = None
     if found.cutoff_hz is None:
-        found = bench.with_cutoff(found, rate, reasons)
-    rows = bench.rows(found)
+        found, rows = bench.with_cutoff(found, rate, reasons)
+    rows = bench.rows(found) if rows is None else rows
     if found.reversal_s is None:
         found = replace(found, reversal_s=_reversal_s(rows, band, found.standstill_rad_s, reasons))
     law, row_law = (coulomb, row_coulomb or coulomb) if coulomb else bench.laws(rows, found, reasons)
@@ -115,7 +118,12 @@ def _excerpt(session: Session, longest_s: float) -> Session:
 
 
 def _with_decimation(
-    settings: SignalSettings, sessions: Sequence[Session], rate: float, motor: bool, reasons: list[str]
+    settings: SignalSettings,
+    sessions: Sequence[Session],
+    rate: float,
+    motor: bool,
+    reasons: list[str],
+    outliers: Outliers,
 ) -> tuple[SignalSettings, float | None]:
     """With the band of the rows; and the upper edge of an earlier low-pass on the torques [Hz], None without."""
     edges = [
@@ -127,7 +135,8 @@ def _with_decimation(
     band = min((edge for edge in edges if edge is not None), default=None)
     if settings.decimate_hz is not None:
         return settings, band
-    rough = [prepare(session, replace(settings, motor_delay_s=0.0), log=False) for session in sessions]
+    stated = replace(settings, motor_delay_s=0.0)
+    rough = [prepare(session, stated, log=False, outliers=outliers) for session in sessions]
     excitation = max(session.excitation_hz for session in rough)
     shortest = min(session.duration_s for session in sessions)
     wanted = {
@@ -188,13 +197,14 @@ class _Bench:
     delays: Sequence[float]
     band: float | None
     block_s: float
+    outliers: Outliers
 
     def rows(self, settings: SignalSettings) -> _ByClass:
         """Rows by side and joint."""
         parts: dict[str, list[BinnedRows]] = {}
         for session, payload, delay in zip(self.sessions, self.payloads, self.delays, strict=True):
             wanted = replace(settings, motor_delay_s=delay, reversal_s=0.0)
-            prepared = prepare(session, wanted, motor=self.motor, log=False)
+            prepared = prepare(session, wanted, motor=self.motor, log=False, outliers=self.outliers)
             for rows in observe_bins(prepared, payload, self.structure, self.columns, _BIN_S):
                 parts.setdefault(rows.side, []).append(rows)
         found = {}
@@ -225,15 +235,20 @@ class _Bench:
             return values
         return low_pass(values, dt, 0.5 * self.band)
 
-    def with_cutoff(self, settings: SignalSettings, rate: float, reasons: list[str]) -> SignalSettings:
-        """With the highest cut-off of a held-back error near the least."""
+    def with_cutoff(
+        self, settings: SignalSettings, rate: float, reasons: list[str]
+    ) -> tuple[SignalSettings, _ByClass]:
+        """With the highest cut-off of a held-back error near the least, and the rows of it."""
         ladder = sorted({min(factor * settings.decimate, NYQUIST_SHARE * rate) for factor in _CUTOFFS})
         still = settings.standstill_rad_s
-        errors = []
+        errors: list[float] = []
+        kept: _ByClass = {}
         for one in ladder:
             rows = self.rows(replace(settings, cutoff_hz=one))
             away = {key: own.known(_WINDOWS[-1] // 2, still) for key, own in rows.items()}
             errors.append(_error(rows, _fit(rows, away), away))
+            # The highest so far near the least so far: no lower one can be chosen any more.
+            kept = rows if errors[-1] < min(errors) + _TOLERANCE else kept
         best = int(np.argmin(errors))
         limit = errors[best] + _TOLERANCE
         chosen = max(one for one, error in zip(ladder, errors, strict=True) if error < limit)
@@ -242,7 +257,7 @@ class _Bench:
             for one, error in zip(ladder, errors, strict=True)
         )
         reasons.append(f"positions: cut-off {chosen:g} Hz, held-back error of the base model {listed}")
-        return replace(settings, cutoff_hz=chosen)
+        return replace(settings, cutoff_hz=chosen), kept
 
     def laws(self, rows: _ByClass, settings: SignalSettings, reasons: list[str]) -> tuple[Coulomb, Coulomb]:
         """The friction laws of the model and of the rows."""

@@ -31,7 +31,8 @@ _ARENA_BYTES = 2**22, 2**28
 """First and largest file of an arena; each has twice the size of the one before."""
 _MOST_BYTES = 64 * 2**20
 _EVERY_S = 0.01
-_M_MMAP_THRESHOLD = -3
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_KEPT_BYTES = 32 * 2**20
 _page = mmap.PAGESIZE
 _open: weakref.WeakSet[Any] = weakref.WeakSet()
 _watch: threading.Thread | None = None
@@ -89,25 +90,27 @@ class Arena:
     def __init__(self) -> None:
         self._held: mmap.mmap | None = None
         self._used, self._next = 0, _ARENA_BYTES[0]
+        self._lock = threading.Lock()
 
     def keep(self, array: NDArray[Any]) -> NDArray[Any]:
         """The same array in a file; a small one as it is."""
         if array.nbytes < _SMALL_BYTES:
             return array
-        if self._held is None or self._used + array.nbytes > len(self._held):
-            size = max(self._next, array.nbytes)
-            try:
-                with tempfile.TemporaryFile(prefix="lwr-") as file:
-                    os.posix_fallocate(file.fileno(), 0, size)
-                    self._held, self._used = mmap.mmap(file.fileno(), size), 0
-            except OSError:
-                # No room in the temporary folder: memory has to do.
-                return array
-            self._next = min(2 * size, _ARENA_BYTES[1])
-            _watched(self._held)
-        kept = np.ndarray(array.shape, array.dtype, self._held, self._used)
+        with self._lock:
+            if self._held is None or self._used + array.nbytes > len(self._held):
+                size = max(self._next, array.nbytes)
+                try:
+                    with tempfile.TemporaryFile(prefix="lwr-") as file:
+                        os.posix_fallocate(file.fileno(), 0, size)
+                        self._held, self._used = mmap.mmap(file.fileno(), size), 0
+                except OSError:
+                    # No room in the temporary folder: memory has to do.
+                    return array
+                self._next = min(2 * size, _ARENA_BYTES[1])
+                _watched(self._held)
+            kept = np.ndarray(array.shape, array.dtype, self._held, self._used)
+            self._used += -(-array.nbytes // 64) * 64
         kept[...] = array
-        self._used += -(-array.nbytes // 64) * 64
         return kept
 
 
@@ -157,6 +160,16 @@ def stored(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
     return rows.array()
 
 
+def stored_together(groups: Iterable[Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
+    """`stored` for several arrays whose parts are made together: the first parts, the second ones, and so on."""
+    rows: list[Growing] = []
+    for group in groups:
+        rows = rows or [Growing() for _ in group]
+        for growing, part in zip(rows, group, strict=True):
+            growing.append(part)
+    return [growing.array() for growing in rows]
+
+
 def _watched(held: mmap.mmap | None) -> None:
     """Bound the memory of all open files: a thread gives pages back, whoever reads them comes by them again."""
     global _watch
@@ -180,6 +193,8 @@ def _prepare_process() -> None:
     with contextlib.suppress(OSError, AttributeError):
         library = ctypes.CDLL(None)
         library.mallopt(_M_MMAP_THRESHOLD, 4 * 2**20)
+        # A part of the heap stays: to return and fetch it again with every array costs more than it is worth.
+        library.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
         library.malloc_trim(0)
 
 

@@ -42,6 +42,13 @@ _GROUPS = {
     help="Put two causes side by side, with their overlap and the discriminating experiment (repeatable).",
 )
 @click.option("--no-simulation", is_flag=True, help="Leave out the replay of the sessions.")
+@click.option(
+    "--jobs",
+    type=click.IntRange(-1, 1024),
+    default=1,
+    show_default=True,
+    help="Threads, with the same results; -1: one a core.",
+)
 @json_option
 def command(
     sessions: tuple[Path, ...],
@@ -55,6 +62,7 @@ def command(
     gear_ratio: str | None,
     compare: tuple[tuple[str, str], ...],
     no_simulation: bool,
+    jobs: int,
     as_json: bool,
 ) -> None:
     """Find errors of the model in SESSIONS, name the causes, and extend the model.
@@ -106,6 +114,7 @@ def command(
         simulate=not no_simulation,
         compare=pairs,
         sure=SURE if experiment is None else experiment.diagnosis.sure,
+        jobs=jobs,
     )
     found = found.with_offers(offers_after_logs(found.diagnosis, experiment))
     found.write(out)

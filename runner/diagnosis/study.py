@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from ident.diagnosis import ArmData, Diagnosis, Reference, diagnose
+from ident.diagnosis import ArmData, Diagnosis, DiagnosisSettings, Reference, diagnose
 from ident.diagnosis.claims_in_words import SURE
 from ident.diagnosis.look_alikes import LookAlikes, Place, look_alikes
 from ident.diagnosis.statements import Statements, statements
@@ -154,13 +154,14 @@ def study(
     simulate: bool = True,
     compare: Sequence[tuple[Place, Place]] = (),
     sure: float = SURE,
+    jobs: int = 1,
 ) -> Study:
     """Diagnose `sessions` and measure the gain.
 
     arm : description of the arm, for stiffness and gear ratios; without it the simulated joints are stiff.
     data : of its drives; default: from the description.
     model : the present model, the baseline of the simulation. reference : model of `lwr-run commission`.
-    compare : causes to put side by side besides those of open findings. sure : see `Study`.
+    compare : causes to put side by side besides those of open findings. sure : see `Study`. jobs : threads.
     Raises DataError for unusable sessions.
     """
     healthy = None if reference is None else Reference.of(reference)
@@ -173,7 +174,14 @@ def study(
     logs, held_out = list(sessions), list(test)
     with _unadvised():
         found = diagnose(
-            logs, chain, test=held_out, arm=data, model=model, reference=healthy, simulate=replay
+            logs,
+            chain,
+            test=held_out,
+            arm=data,
+            model=model,
+            reference=healthy,
+            settings=DiagnosisSettings(jobs=jobs),
+            simulate=replay,
         )
         pairs, unshown = look_alikes(found, sessions, chain, compare, arm=data, reference=healthy)
     notes = [*found.notes, *_little(found, everything)]

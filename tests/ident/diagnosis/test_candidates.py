@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from ident.diagnosis.candidates import Candidate, find_bursts
+from fri.errors import ConfigurationError
+from ident.diagnosis.candidates import Candidate, Dictionary, find_bursts
+from ident.diagnosis.evidence import Evidence
+from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.signatures import signature_bench
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS
@@ -66,3 +71,49 @@ def test_remembered_products_are_those_of_the_present_columns(
         assert again.base.shape[2] == evidence.base_count + sum(
             next(iter(r.values())).shape[1] for r in extra
         )
+
+
+def test_columns_by_parts_are_those_of_whole_motions(make: Callable[..., Session], chain: Chain) -> None:
+    bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
+    nominal, setting = bench.nominal, bench.dictionary.setting
+    for cause in ("presliding_hysteresis", "friction_temperature", "joint_zero_offset", "joint_torque_delay"):
+        effect = EFFECTS[cause]
+        for shape in effect.shapes(setting, 1):
+            whole = [effect.columns(motion, 1, shape) for motion in nominal.motions]
+            parts = nominal.columns(lambda m, e=effect, s=shape: e.columns(m, 1, s))
+            for k, columns in enumerate(zip(*whole, strict=True)):
+                for side in nominal.rows:
+                    signals = [getattr(column, side) for column in columns]
+                    if signals[0] is not None:
+                        expected = nominal.reduce(side, signals)
+                        scale = np.abs(expected).max()
+                        np.testing.assert_allclose(parts[side][k], expected, rtol=1e-9, atol=1e-9 * scale)
+
+
+def test_a_dictionary_of_fewer_causes_keeps_its_columns(make: Callable[..., Session], chain: Chain) -> None:
+    bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
+    more = bench.dictionary.of(["sensor_gain", "cable_spring"])
+    before = [t for t in more.trials() if t.candidate.cause == "sensor_gain"]
+    after = list(more.of(["sensor_gain"]).trials())
+    assert before
+    assert [t.score.gain for t in after] == [t.score.gain for t in before]
+    assert all(a.rows is b.rows for a, b in zip(after, before, strict=True))
+
+
+def test_any_number_of_threads_gives_the_same_trials(make: Callable[..., Session], chain: Chain) -> None:
+    bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
+    found = []
+    for jobs in (1, 2, 3):
+        settings = replace(bench.nominal.settings, jobs=jobs)
+        nominal = replace(bench.nominal, settings=settings)
+        evidence = Evidence(nominal, settings, bench.evidence.sigma, bench.evidence.variance_inflation)
+        trials = list(Dictionary(nominal, evidence).trials())
+        found.append([(t.candidate.key, t.shape, t.score.gain, *t.score.coefficients) for t in trials])
+    assert len(found[0]) > 30
+    assert found[1] == found[0]
+    assert found[2] == found[0]
+
+
+def test_no_threads_are_refused() -> None:
+    with pytest.raises(ConfigurationError, match="`jobs` is 0; give a number of threads"):
+        DiagnosisSettings(jobs=0)

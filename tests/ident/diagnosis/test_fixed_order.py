@@ -13,8 +13,10 @@ from ident.diagnosis.evidence import Evidence
 
 random = np.random.default_rng(1)
 keys = [(side, joint) for side in ("motor", "joint") for joint in range(7)]
-columns = {key: random.normal(size=(3, 20, 2)) for key in keys}
-evidence = SimpleNamespace(blocks=3, _weights=dict(zip(keys, random.uniform(1.0, 1e3, len(keys)))))
+columns = {key: random.normal(size=(60, 2)) for key in keys}
+weights = dict(zip(keys, random.uniform(1.0, 1e3, len(keys))))
+starts = dict.fromkeys(("motor", "joint"), np.array([0, 20, 40, 60]))
+evidence = SimpleNamespace(blocks=3, _weights=weights, _starts=starts)
 print(Evidence._cross(evidence, columns, columns).tobytes().hex())
 """
 

@@ -297,3 +297,29 @@ def test_no_delay_falls_between_the_shapes_that_are_tried(cause: str) -> None:
         for true in (delay, -delay):
             found = true / tried
             assert np.any((found > 1.1 * share.low) & (found < 0.95 * share.high)), true
+
+
+@pytest.mark.parametrize("cause", sorted(EFFECTS))
+def test_columns_of_a_part_are_those_of_the_whole_motion(cause: str, motion: ArmMotion) -> None:
+    effect, whole = EFFECTS[cause], replace(motion)
+    middle, scattered = slice(700, 1300), np.arange(100, 1900, 7)
+    parts = [(some, whole.part(some)) for some in (middle, scattered)]
+    for shape in shapes(cause):
+        columns = effect.columns(motion, 1, shape)
+        for some, part in parts:
+            for column, own in zip(columns, effect.columns(part, 1, shape), strict=True):
+                for side in ("motor", "joint"):
+                    expected, found = getattr(column, side), getattr(own, side)
+                    assert (expected is None) == (found is None)
+                    if expected is not None:
+                        # Elastic joints: a difference of torques over 1e-5 or 1e-4.
+                        np.testing.assert_allclose(found, expected[some], rtol=1e-7, atol=1e-8)
+                        assert side in effect.seen_by
+
+
+def test_a_part_far_from_its_neighbours_has_the_step_of_the_whole(motion: ArmMotion) -> None:
+    part = motion.part(np.array([10, 500, 1500]))
+    assert part.dt == motion.dt
+    around = motion.part(slice(500, 600)).around(0.01)
+    assert around.time[0] < motion.time[500] - 0.01
+    assert around.time[-1] > motion.time[599] + 0.01

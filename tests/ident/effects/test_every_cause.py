@@ -172,7 +172,9 @@ def simulated(
     if np.any(shift):
         # The arm stands at the published position less the shift.
         rate = np.gradient(shift, DT, axis=0)
-        moved = motion.displaced(-shift, -rate, -np.gradient(rate, DT, axis=0))
+        change = np.gradient(rate, DT, axis=0)
+        moved = motion.rigid_torque(motion.q - shift, motion.qd - rate, motion.qdd - change)
+        moved = moved - motion.rigid_torque(motion.q, motion.qd, motion.qdd)
         motor, joint = motor + moved, joint + moved
     if not np.array_equal(turned[-1], down):
         tilted = replace(motion.chain, gravity=turned[-1])
