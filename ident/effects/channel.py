@@ -171,6 +171,16 @@ class SensorSaturation(Effect):
         """Of a limit read from the samples: the sharpness of an amplifier's end."""
         return {"limit": _SHARP * parameters["limit"]} if form is _Clipping.SEEN else {}
 
+    def plausible(self, coefficients: Floats, shape: Shape) -> bool:
+        """Within its range; at a limit that the samples show, above it too. A model fitted to clipped torques predicts
+        too little beyond the limit until the cause is in it."""
+        low = self.linear[0].low
+        return (
+            bool(coefficients[0] > low)
+            if self.seen_in_samples(shape)
+            else super().plausible(coefficients, shape)
+        )
+
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The clipped part of the predicted torque."""
         torque = motion.joint_torque[:, joint]

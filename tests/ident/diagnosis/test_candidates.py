@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -117,3 +118,14 @@ def test_any_number_of_threads_gives_the_same_trials(make: Callable[..., Session
 def test_no_threads_are_refused() -> None:
     with pytest.raises(ConfigurationError, match="`jobs` is 0; give a number of threads"):
         DiagnosisSettings(jobs=0)
+
+
+def test_a_limit_in_the_samples_is_believed_above_the_excess_that_a_clipped_model_predicts() -> None:
+    effect = EFFECTS["sensor_saturation"]
+    bent, tiny = np.array([1.6]), np.array([0.1])
+    seen = next(iter(effect.shapes(SimpleNamespace(clipped=np.array([5.0])), 0)))
+    guessed = next(iter(effect.shapes(SimpleNamespace(clipped=None, torque_range=np.array([9.0])), 0)))
+    assert effect.plausible(bent, seen)
+    assert not effect.plausible(bent, guessed)
+    assert not effect.plausible(tiny, seen)
+    assert not effect.plausible(tiny, guessed)
