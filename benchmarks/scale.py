@@ -118,12 +118,16 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--minutes", type=float, nargs="+", default=[1.0, 10.0, 60.0])
     parser.add_argument("--commands", nargs="+", default=["identify", "validate", "diagnose"])
     parser.add_argument("--folder", type=Path, default=Path("scale"), help="for the tiled sessions; kept")
-    parser.add_argument("--recorded", action="store_true", help="diagnose the experiment's own sessions first")
+    parser.add_argument(
+        "--recorded", action="store_true", help="diagnose the experiment's own sessions first"
+    )
     chosen = parser.parse_args(arguments)
     if chosen.recorded:
         chosen.folder.mkdir(parents=True, exist_ok=True)
         code, wall, cpu, peak = measure(recorded(chosen.logs, chosen.folder), chosen.folder / "recorded.txt")
-        print(f"diagnose   as recorded: CPU {cpu:6.1f} s, wall {wall:6.1f} s, peak {peak:6.0f} MB, exit {code}")
+        print(
+            f"diagnose   as recorded: CPU {cpu:6.1f} s, wall {wall:6.1f} s, peak {peak:6.0f} MB, exit {code}"
+        )
     for minutes in chosen.minutes:
         folder = chosen.folder / f"{minutes:g}min"
         folder.mkdir(parents=True, exist_ok=True)

@@ -17,12 +17,12 @@ from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.sparse import csr_array
 
 from ident.diagnosis.broken_data import unseen
+from ident.diagnosis.parts import Piece, gather
 from ident.diagnosis.recording import RecordStretch, SessionRecord, usual_step
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics import regressor
@@ -149,9 +149,7 @@ class Nominal:
     _operators: dict[tuple[str, int, float], tuple[csr_array, float]] = field(
         default_factory=dict, init=False, repr=False
     )
-    _pieces: dict[tuple[object, ...], list[list[_Piece]]] = field(
-        default_factory=dict, init=False, repr=False
-    )
+    _pieces: dict[tuple[object, ...], list[list[Piece]]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         self.motions = self.motions or in_order([self._motion(r, s, s.effort) for r, s in self.stretches])
@@ -354,14 +352,14 @@ class Nominal:
             rows: dict[tuple[str, int], Floats] = {}
             for piece in pieces:
                 for k, one in enumerate(made(piece.motion)):
-                    for side, gather in piece.gathers.items():
+                    for side, own in piece.gathers.items():
                         values = one.motor if side == "motor" else one.joint
                         if values is None:
                             continue
                         if (side, k) not in rows:
                             count = self._operator(side, number, recording, stretch)[0].shape[0]
                             rows[side, k] = np.zeros((count, *values.shape[1:]))
-                        gather.add(values, rows[side, k])
+                        own.add(values, rows[side, k])
             for (side, k), values in rows.items():
                 if self.band_hz[side] is not None:
                     dt = self._operator(side, number, recording, stretch)[1]
@@ -373,7 +371,7 @@ class Nominal:
 
     def _cut(
         self, sides: Sequence[str], number: int, recording: SessionRecord, stretch: RecordStretch
-    ) -> Iterator[_Piece]:
+    ) -> Iterator[Piece]:
         """Parts of a motion that fit into the processor's cache, with the samples in use alone."""
         held = [side for side in sides if _holds(recording, stretch, side)]
         operators = {side: self._operator(side, number, recording, stretch)[0].tocsc() for side in held}
@@ -386,8 +384,8 @@ class Nominal:
         for here in runs:
             whole = slice(int(here[0]), int(here[-1]) + 1)
             picked = whole if len(here) > _DENSE * (whole.stop - whole.start) else here
-            parts = {side: _gather(operator[:, picked]) for side, operator in operators.items()}
-            yield _Piece(self.motions[number].part(picked), parts)
+            parts = {side: gather(operator[:, picked]) for side, operator in operators.items()}
+            yield Piece(self.motions[number].part(picked), parts)
 
     def _operator(
         self, side: str, number: int, recording: SessionRecord, stretch: RecordStretch
@@ -564,58 +562,6 @@ class Nominal:
             chosen,
             width,
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _Gather:
-    """A part of an operator: rows from `first` on, made from samples of a part of a motion (CSR)."""
-
-    first: int
-    starts: NDArray[np.int32]
-    samples: NDArray[np.int32]
-    weights: Floats
-
-    def add(self, values: Floats, rows: Floats) -> None:
-        """Add what samples (N,) or (N, k) contribute to rows (m,) or (m, k)."""
-        here = rows[self.first : self.first + len(self.starts) - 1]
-        if values.ndim == 1:
-            _add_one(self.starts, self.samples, self.weights, values, here)
-        else:
-            _add_many(self.starts, self.samples, self.weights, values, here)
-
-
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """A part of a motion and its share of the rows of each side."""
-
-    motion: ArmMotion
-    gathers: dict[str, _Gather]
-
-
-def _gather(operator: Any) -> _Gather:
-    """The rows that are not empty of an operator (m, N), which are neighbours."""
-    matrix = csr_array(operator)
-    full = np.flatnonzero(np.diff(matrix.indptr))
-    first, last = (int(full[0]), int(full[-1]) + 1) if len(full) else (0, 0)
-    starts = matrix.indptr[first : last + 1].astype(np.int32)
-    return _Gather(first, starts, matrix.indices.astype(np.int32), matrix.data)
-
-
-@njit(cache=True, nogil=True)
-def _add_one(starts, samples, weights, values, rows):  # type: ignore[no-untyped-def]
-    for row in range(len(starts) - 1):
-        total = 0.0
-        for k in range(starts[row], starts[row + 1]):
-            total += weights[k] * values[samples[k]]
-        rows[row] += total
-
-
-@njit(cache=True, nogil=True)
-def _add_many(starts, samples, weights, values, rows):  # type: ignore[no-untyped-def]
-    for row in range(len(starts) - 1):
-        for k in range(starts[row], starts[row + 1]):
-            for own in range(values.shape[1]):
-                rows[row, own] += weights[k] * values[samples[k], own]
 
 
 def _holds(recording: SessionRecord, stretch: RecordStretch, side: str) -> bool:
