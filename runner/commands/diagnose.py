@@ -45,7 +45,7 @@ _GROUPS = {
 @click.option(
     "--jobs",
     type=click.IntRange(-1, 1024),
-    default=1,
+    default=-1,
     show_default=True,
     help="Threads, with the same results; -1: one a core.",
 )

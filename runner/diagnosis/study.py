@@ -154,14 +154,14 @@ def study(
     simulate: bool = True,
     compare: Sequence[tuple[Place, Place]] = (),
     sure: float = SURE,
-    jobs: int = 1,
+    jobs: int = -1,
 ) -> Study:
     """Diagnose `sessions` and measure the gain.
 
     arm : description of the arm, for stiffness and gear ratios; without it the simulated joints are stiff.
     data : of its drives; default: from the description.
     model : the present model, the baseline of the simulation. reference : model of `lwr-run commission`.
-    compare : causes to put side by side besides those of open findings. sure : see `Study`. jobs : threads.
+    compare : causes to put side by side besides those of open findings. sure : see `Study`. jobs : threads, -1 for one a core.
     Raises DataError for unusable sessions.
     """
     healthy = None if reference is None else Reference.of(reference)
