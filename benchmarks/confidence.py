@@ -227,7 +227,7 @@ def _draw(sources: Sequence[str], p: Floats, right: Floats, path: Path) -> None:
             said, share, [share - middle + half, middle + half - share], fmt="o-", capsize=3, label=label
         )
     axes.set(xlabel="confidence stated", ylabel="share right", xlim=(0, 1.02), ylim=(0, 1.02))
-    axes.legend(fontsize="small", loc="upper left")
+    axes.legend(fontsize="small", loc="lower right")
     figure.savefig(path, metadata={"Date": None})
 
 

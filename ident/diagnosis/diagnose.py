@@ -26,11 +26,12 @@ from ident.diagnosis.broken_data import (
 )
 from ident.diagnosis.candidates import Candidate
 from ident.diagnosis.conclusion import conclude
+from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import confirmed_delay
 from ident.diagnosis.evidence import Score
 from ident.diagnosis.recording import record, settled, usual_step
 from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
-from ident.diagnosis.result import Diagnosis
+from ident.diagnosis.result import Diagnosis, Finding
 from ident.diagnosis.selection import Claim, Selection, best_candidate
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.task import Baseline, Simulate, State, Task
@@ -166,7 +167,10 @@ def _in_time(task: Task, state: State) -> State:
             notes.append(_own_delay(claim, unknown))
         # A delay explained by the rest of the model, or usual from day to day, is no finding.
         elif finding.evidence.p_value < _ONE_IN:
-            timing.append(finding)
+            if believable(finding.grounds):
+                timing.append(finding)
+            else:
+                notes.append(_corrected_delay(claim, finding))
     selection.claims = [c for c in selection.claims if c not in _late(selection)]
     return replace(after, timing=tuple(timing), notes=tuple(notes))
 
@@ -231,6 +235,14 @@ def _unknown_delay(task: Task, claim: Claim) -> float:
         return 0.0
     stretches = [s for r in task.recordings for s in r.stretches if s.own_clock]
     return max((usual_step(s.motor_time) + usual_step(s.time) for s in stretches), default=0.0)
+
+
+def _corrected_delay(claim: Claim, finding: Finding) -> str:
+    delay = 1e3 * finding.parameters["delay"].value
+    return (
+        f"{claim.trial.candidate.effect.channel} torques look {abs(delay):.1f} ms {'late' if delay > 0 else 'early'} "
+        "against the healthy arm; this was corrected, and the evidence is too small for a finding"
+    )
 
 
 def _own_delay(claim: Claim, limit: float) -> str:
