@@ -347,3 +347,25 @@ def test_verdict_words_of_a_table_have_their_colour(monkeypatch: pytest.MonkeyPa
     status.write(Listing(("", "condition"), rows), stream=stream)
     assert "\x1b[32mok" in stream.getvalue()
     assert "\x1b[1;31mFAIL" in stream.getvalue()
+
+
+def _numbers() -> list[tuple[str, click.Parameter]]:
+    context = click.Context(main)
+    commands = {verb: main.get_command(context, verb) for verb in VERBS}
+    return [
+        (verb, param)
+        for verb, command in commands.items()
+        if command is not None
+        for param in command.params
+        if isinstance(param.type, click.types.FloatParamType)
+    ]
+
+
+def test_numbers_of_every_command_are_finite():
+    numbers = _numbers()
+    assert len(numbers) > 8
+    for verb, param in numbers:
+        for text in ("nan", "inf", "-inf"):
+            with pytest.raises(click.BadParameter, match="no finite number|not in the range"):
+                param.type.convert(text, param, None)
+            assert verb
