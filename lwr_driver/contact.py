@@ -195,6 +195,7 @@ class ContactWatch:
         self._parts = tuple(_parts(packet) for packet in (self._now, self._last))
         self._step, self._change, self._odd = (np.zeros(4 * JOINTS) for _ in range(3))
         self._calm = np.zeros(4 * JOINTS, dtype=bool)
+        self._bend = np.zeros(2 * JOINTS)  # of the way over lost packets, against the last velocity
         # Position and velocity of the low-pass, and its input.
         self._filter, self._next = np.zeros((3, 2 * JOINTS)), np.zeros((2, 2 * JOINTS))
         self._state, self._input = self._filter[:2], self._filter[2]
@@ -330,6 +331,7 @@ class ContactWatch:
         one that includes the jump would make the packets to come seem odd, without an end.
         """
         now, last, step, change, odd = self._now, self._last, self._step, self._change, self._odd
+        self._bend[:] = 0.0
         np.multiply(step, -cycles, out=odd)
         odd += change
         np.abs(odd, out=odd)
@@ -348,7 +350,10 @@ class ContactWatch:
             return
         self._doubted = False
         if not jumps:
-            np.divide(change[:JOINTS], cycles, out=step[:JOINTS])
+            bend = self._bend[:JOINTS]
+            if cycles > 1:
+                np.subtract(change[:JOINTS], cycles * step[:JOINTS], out=bend)
+            np.divide(change[:JOINTS] + bend, cycles, out=step[:JOINTS])
             return
         moved = (now[:JOINTS] - self._doubtful[:JOINTS]) / cycles
         if self._settling:
@@ -358,13 +363,16 @@ class ContactWatch:
         np.clip(moved, -self._fastest, self._fastest, out=step[:JOINTS])
 
     def _low_pass(self, cycles: int) -> None:
-        """Advance F from the last packet to this one, with straight lines between them."""
+        """Advance F from the last packet to this one: positions with a constant acceleration, torques straight."""
         source, ends = self._input, 2 * JOINTS
         change, last = self._change[:ends], self._last[:ends]
         for part in range(cycles):
             np.multiply(change, (2 * part + 1) / cycles, out=source)
             np.add(source, last, out=source)
             np.add(source, last, out=source)
+            if cycles > 1:
+                # The sum of both ends of the parabola, less that of the straight line.
+                source += (part**2 + (part + 1) ** 2 - (2 * part + 1) * cycles) / cycles**2 * self._bend
             self._advance.dot(self._filter, self._next)
             self._state[:] = self._next
 

@@ -366,6 +366,6 @@ def test_numbers_of_every_command_are_finite():
     assert len(numbers) > 8
     for verb, param in numbers:
         for text in ("nan", "inf", "-inf"):
-            with pytest.raises(click.BadParameter, match="no finite number|not in the range"):
+            with pytest.raises(click.BadParameter, match=r"no finite number|not in the range"):
                 param.type.convert(text, param, None)
             assert verb
