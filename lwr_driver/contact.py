@@ -118,7 +118,8 @@ class Contact(NamedTuple):
     def describe(self, joint_names: tuple[str, ...]) -> str:
         """The message with subject, value and limit."""
         name = joint_names[self.joint]
-        return f"{name} {self.quantity} {self.value:.1f} Nm exceeds {self.limit:.1f} Nm"
+        digits = 1 if self.value > self.limit + 0.1 else 3
+        return f"{name} {self.quantity} {self.value:.{digits}f} Nm exceeds {self.limit:.{digits}f} Nm"
 
     @property
     def advice(self) -> str:

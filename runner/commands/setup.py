@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from contextlib import ExitStack
+from pathlib import Path
 
 import click
 from click.shell_completion import get_completion_class
@@ -12,7 +13,7 @@ from click.shell_completion import get_completion_class
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import CONFIGS
 from runner.status import StatusLine, write
-from runner.terminal import NAMED_FILE, FiniteRange, default_file, json_option, tell, verb
+from runner.terminal import NAMED_FILE, PATH, FiniteRange, default_file, json_option, tell, verb
 
 
 @verb("doctor")
@@ -156,6 +157,12 @@ def emulator_command(
     from sim_backend.configuration import read_settings
     from sim_backend.process import EmulatorProcess
 
+    if program is not None and program.lower().endswith(".src"):
+        # As every file of a command line, in the working folder; else beside the configuration.
+        if not Path(config).with_name(program).is_file():
+            PATH.require(Path(program))
+        if Path(program).is_file():
+            program = str(Path(program).resolve())
     emulator = EmulatorProcess(
         config,
         lock_step=lock_step,

@@ -287,7 +287,9 @@ def _read_pose(path: Path, name: str | None, joints: int) -> Any:
         listed = ", ".join(map(str, known)) if isinstance(known, dict) else "none"
         raise ConfigurationError(f"{path}: no pose {name or 'moves.home'}; poses there: {listed}") from error
     if q.shape != (joints,) or not np.all(np.isfinite(q)) or np.abs(q).max() > 2.0 * np.pi:
+        degrees = q.shape == (joints,) and 2.0 * np.pi < np.abs(q).max() <= 360.0
         raise ConfigurationError(
             f"{path}: pose {name or 'moves.home'} must be {joints} joint positions in rad"
+            + ("; these look like deg" if degrees else "")
         )
     return q
