@@ -54,7 +54,7 @@ _FASTEST_RAD_S = 4.0  # a joint is slower
 # A position repeated to the last bit is stale if its joint was faster than braking to rest in one packet allows.
 _REPEATED_RAD, _BRAKING_RAD_S2 = 5e-5, 10.0
 _STALE_S, _STALE_PACKETS = 10e-3, 3
-_AT_REST_S = 1.0  # repeated for so long, it is at rest
+_AT_REST_S = 0.1  # repeated for so long, it is at rest
 
 
 @dataclass(frozen=True)

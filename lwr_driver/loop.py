@@ -465,7 +465,9 @@ class Loop:
 
     @property
     def _stale(self) -> Stale | None:
-        return None if self._watch is None else self._watch.stale
+        """A stale measurement that began in this motion; one before it is an arm that stopped at once."""
+        found = None if self._watch is None else self._watch.stale
+        return found if found is not None and found.seconds <= self._commander.index * self._period else None
 
     def _react(self, touched: Contact | None, elapsed: int, sent: bool) -> None:
         """In command mode, end a motion after a contact, or after a link rated bad for too long.

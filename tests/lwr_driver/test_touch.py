@@ -296,6 +296,13 @@ def test_stale_measurement_ends_the_motion_by_its_own_name(rig):
     check_sent(r)
 
 
+def test_an_arm_that_stopped_at_once_before_the_motion_is_no_stale_measurement(rig):
+    r = rig()
+    hand(r).stale = Stale(1, 0.45, 0.09)
+    in_motion(r, 20)
+    assert r.mode is Mode.MOTION
+
+
 def test_unacceptable_quality_in_command_mode_stops_the_motion(rig):
     r = rig(policy=LENIENT)
     in_motion(r)
