@@ -42,6 +42,7 @@ TICK_MS = 12
 _LONGEST_RUN = 2000
 _DEEPEST = 100
 _SPEED_SHARE = 0.25
+_FRAME = frozenset("XYZABC")
 _SHORTEST_MOTION_MS = 50.0
 _OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
     "AND": lambda a, b: a and b,
@@ -430,7 +431,9 @@ class KrlProgram:
                 session.resync(self.machinery.position if soft else None)
             return
         goal = self._value(statement.goal)
-        if not isinstance(goal, dict) or not any(axis in goal for axis in AXIS_NAMES[:6]):
+        axes = isinstance(goal, dict) and goal.keys() & AXIS_NAMES
+        # A frame may have E1 too.
+        if not axes or (axes == {"E1"} and goal.keys() & _FRAME):
             self.machinery.say(f"{self.name}, line {statement.line}: a Cartesian goal is passed over")
             return
         target = positions(goal, session.krl_setpoint, relative=statement.relative)

@@ -107,8 +107,9 @@ def _data_line(
     line: _Line, declarations: dict[str, Declaration], elements: list[Assign], external: set[str]
 ) -> None:
     """One line of a data list."""
-    word = line.peek
-    if word in ("DEFDAT", "ENDDAT", "SIGNAL", "IMPORT", "STRUC", "ENUM"):
+    words = [text for _, text in line.tokens[:2]]
+    word = words[-1] if words[0] == "GLOBAL" else words[0]
+    if word in ("DEFDAT", "ENDDAT", "IMPORT", "STRUC", "ENUM"):
         return
     if word in ("EXT", "EXTFCT", "EXTP", "EXTFCTP"):
         external.add(_external(line))
@@ -147,6 +148,11 @@ def _external(line: _Line) -> str:
 def _declare(line: _Line) -> dict[str, Declaration] | None:
     """Variables declared in a line; None for any other line."""
     tokens, at = line.tokens, 0
+    words = [text for _, text in tokens]
+    if "SIGNAL" in words[:2] and tokens[words.index("SIGNAL") + 1 :][:1]:
+        # An input or output, or the number in several: a variable that nothing is wired to.
+        title = words[words.index("SIGNAL") + 1]
+        return {title: Declaration(title, "INT" if "TO" in words else "BOOL", 0, None, line.number)}
     while at < len(tokens) and tokens[at][1] in ("DECL", "GLOBAL", "CONST"):
         at += 1
     plain = at == 0 or tokens[at - 1][1] == "GLOBAL"

@@ -178,6 +178,7 @@ _KEPT: dict[str, Any] = {
 #: Functions of the controller with the least and largest number of arguments.
 FUNCTIONS = {
     "FRISETUP": (3, 3), "FRIOPEN": (1, 1), "FRISTART": (1, 1), "FRISTOP": (0, 0), "FRICLOSE": (0, 0),
+    "FRISHOW": (0, 0),
     "BAS": (1, 2), "SWRITE": (4, 12), "SREAD": (4, 12), "CWRITE": (3, 12), "VARSTATE": (1, 1),
     "ABS": (1, 1), "SQRT": (1, 1), "SIN": (1, 1), "COS": (1, 1), "TAN": (1, 1), "ACOS": (1, 1), "ATAN2": (2, 2),
 }  # fmt: skip
@@ -434,8 +435,8 @@ class System:
                 session.fri_close()
         except (ValueError, TypeError) as error:
             raise RobotError(f"{name}: {error}") from error
-        # friSetup and BAS have no effect: address, tool and velocities are the emulator's own. Neither have the
-        # subprograms of modules that are not there.
+        # friSetup, friShow and BAS have no effect: address, tool and velocities are the emulator's own. Neither
+        # have the subprograms of modules that are not there.
         return f"#{session.state.name}" if name.startswith("FRI") else 0
 
 

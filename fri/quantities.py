@@ -32,6 +32,7 @@ MISTAKEN: dict[str, tuple[tuple[str, float], ...]] = {
     "deg/s": (("rad/s", 1.0 / _DEGREE),),
     "m": (("mm", 1e-3), ("cm", 1e-2)),
     "kg": (("g", 1e-3),),
+    "s": (("ms", 1e-3),),
     "kg m²": (("kg cm²", 1e-4), ("kg mm²", 1e-6)),
     "share": (("percent", 1e-2),),
 }
@@ -96,13 +97,17 @@ def check(owner: Any) -> None:
 def suspected(value: Any, unit: str, inside: typing.Callable[[float], bool]) -> str:
     """Sentence on a value that is right in another unit, or "". value : a number or a list of numbers."""
     listed = value if isinstance(value, list) else [value]
+    fitting = []
     for other, factor in MISTAKEN.get(unit, ()):
         mended = [factor * number for number in listed]
         if all(inside(number) for number in mended):
             shown = ", ".join(f"{number:.4g}" for number in mended)
-            wanted = "as a share of 1" if unit == "share" else f"in {unit}"
-            return f"it looks like {other}; write it {wanted}: {f'[{shown}]' if listed is value else shown}"
-    return ""
+            fitting.append((other, f"[{shown}]" if listed is value else shown))
+    if not fitting:
+        return ""
+    others, values = (" or ".join(texts) for texts in zip(*fitting, strict=True))
+    wanted = "as a share of 1" if unit == "share" else f"in {unit}"
+    return f"it looks like {others}; write it {wanted}: {values}"
 
 
 def described(meta: Meta) -> str:

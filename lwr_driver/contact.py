@@ -51,6 +51,10 @@ _LEAST_KG = 0.3  # smaller differences of the gravity torque are no payload
 # Jumps between two packets, believed with the second packet: of the position by more than an acceleration makes.
 _JUMP_RAD, _JUMP_RAD_S2, _JUMP_SHARE = 5e-3, 20.0, 0.5
 _FASTEST_RAD_S = 4.0  # a joint is slower
+# A position repeated to the last bit is stale if its joint was faster than braking to rest in one packet allows.
+_REPEATED_RAD, _BRAKING_RAD_S2 = 5e-5, 10.0
+_STALE_S, _STALE_PACKETS = 10e-3, 3
+_AT_REST_S = 0.1  # repeated for so long, it is at rest
 
 
 @dataclass(frozen=True)
@@ -114,7 +118,8 @@ class Contact(NamedTuple):
     def describe(self, joint_names: tuple[str, ...]) -> str:
         """The message with subject, value and limit."""
         name = joint_names[self.joint]
-        return f"{name} {self.quantity} {self.value:.1f} Nm exceeds {self.limit:.1f} Nm"
+        digits = 1 if self.value > self.limit + 0.1 else 3
+        return f"{name} {self.quantity} {self.value:.{digits}f} Nm exceeds {self.limit:.{digits}f} Nm"
 
     @property
     def advice(self) -> str:
@@ -122,6 +127,26 @@ class Contact(NamedTuple):
         if self.quantity == _QUANTITIES[0]:
             return "free the arm, or slow the motion down"
         return "free the arm; if nothing touches it, check its payload, load data and torque sensors"
+
+
+class Stale(NamedTuple):
+    """A measured position that has stopped to change in motion: joint from 0, time [s], velocity before [rad/s]."""
+
+    joint: int
+    seconds: float
+    velocity: float
+
+    def describe(self, joint_names: tuple[str, ...]) -> str:
+        """The message with subject, value and advice."""
+        return (
+            f"stale measurement: {joint_names[self.joint]} measured position has not changed for {self.seconds:.3f} s "
+            f"at {abs(self.velocity):.2f} rad/s"
+        )
+
+    @property
+    def advice(self) -> str:
+        """The remedy."""
+        return "the controller repeats old values; look at the pendant, and try a longer cycle of friOpen"
 
 
 _QUANTITIES = ("joint torque", "external torque by the controller's estimate", "external torque by the model")
@@ -134,6 +159,10 @@ class ContactWatch:
 
     external : own estimate of the external torque (7,) [Nm], positive if it drives the joint forward; zero if unknown
     allowed : its limit at present (7,) [Nm]
+    stale : a measured position repeated in several packets of a motion; None if there is none
+
+    A position repeated to the last bit at speed counts as a lost packet: no obstacle stops a joint so, its elastic
+    joint goes on. Joint torque and the controller's estimate are watched meanwhile.
 
     The payload is known from `carry`. Otherwise its weight is taken from the packet's gravity torque, the controller's
     load data, and the inertia that belongs to this weight from `weigh`. A channel of joint torques all exactly zero
@@ -167,11 +196,14 @@ class ContactWatch:
         self._parts = tuple(_parts(packet) for packet in (self._now, self._last))
         self._step, self._change, self._odd = (np.zeros(4 * JOINTS) for _ in range(3))
         self._calm = np.zeros(4 * JOINTS, dtype=bool)
+        self._bend = np.zeros(2 * JOINTS)  # of the way over lost packets, against the last velocity
         # Position and velocity of the low-pass, and its input.
         self._filter, self._next = np.zeros((3, 2 * JOINTS)), np.zeros((2, 2 * JOINTS))
         self._state, self._input = self._filter[:2], self._filter[2]
         self._excess = np.full((3, JOINTS), -np.inf)
         self._known = False
+        self.stale: Stale | None = None
+        self._repeats, self._unmeasured = 0, 0  # packets on end, and their cycles
         self._open = np.ones(JOINTS)  # share of the friction of uncertain sign
         self._doubted = False
         self._alive = False
@@ -191,6 +223,7 @@ class ContactWatch:
         self._closing = np.exp(-0.5 * cutoff * period_s)
         self._settled = int(np.ceil(_SETTLING / (cutoff * period_s)))
         self._fastest = _FASTEST_RAD_S * period_s
+        self._period, self._slowest = period_s, _REPEATED_RAD + _BRAKING_RAD_S2 * period_s**2
         self._jump[:JOINTS] = _JUMP_RAD + _JUMP_RAD_S2 * period_s**2
         self._known = False
 
@@ -239,9 +272,13 @@ class ContactWatch:
         now, last, change = self._now, self._last, self._change
         parts, others = self._parts
         parts[0][:], parts[1][:], parts[2][:], parts[3][:] = q, tau, estimate, gravity
+        if self._known and self._repeated(cycles):
+            return self._exceeded(parts[4])
+        cycles += self._unmeasured
+        self.stale, self._repeats, self._unmeasured = None, 0, 0
         if not self._known or not 0 < cycles <= _MOST_CYCLES:
-            cycles = 1
-            self._begin()
+            gap, cycles = cycles, 1
+            self._begin(gap if self._known else 0)
         np.subtract(now, last, out=change)
         self._believe(cycles)
         self._alive = self._alive or bool(parts[1].any())
@@ -250,8 +287,25 @@ class ContactWatch:
         self._estimate(parts[3])
         self._last, self._now = now, last
         self._parts = others, parts
+        return self._exceeded(parts[4])
+
+    def _repeated(self, cycles: int) -> bool:
+        """Whether this packet repeats the position of a joint at speed."""
+        same = (self._now[:JOINTS] == self._last[:JOINTS]) & (np.abs(self._step[:JOINTS]) > self._slowest)
+        if not same.any():
+            return False
+        self._repeats, self._unmeasured = self._repeats + 1, self._unmeasured + cycles
+        seconds = self._unmeasured * self._period
+        if self._repeats >= _STALE_PACKETS and seconds > _STALE_S - 0.5 * self._period:
+            joint = int(np.argmax(np.where(same, np.abs(self._step[:JOINTS]), 0.0)))
+            self.stale = Stale(joint, seconds, self._step[joint] / self._period)
+        # After so long it rests indeed.
+        return seconds < _AT_REST_S
+
+    def _exceeded(self, torques: Floats) -> Contact | None:
+        """The limit exceeded by joint torque and controller's estimate (2, 7), or by the own estimate."""
         excess = self._excess
-        np.abs(parts[4], out=excess[:2])
+        np.abs(torques, out=excess[:2])
         excess[0] -= self._most
         excess[1] -= self.allowed
         np.abs(self.external, out=excess[2])
@@ -259,11 +313,15 @@ class ContactWatch:
         # Also false for NaN.
         return None if np.maximum.reduce(excess, axis=None) <= 0.0 else self._contact()
 
-    def _begin(self) -> None:
-        """Begin with this packet, at rest."""
-        self._last[:] = self._now
-        self._filter[0], self._filter[1] = self._now[: 2 * JOINTS], 0.0
+    def _begin(self, cycles: int = 0) -> None:
+        """Begin with this packet: at rest, or moving as since the last packet, so many `cycles` before."""
         self._step[:] = 0.0
+        if cycles > 0:
+            step = (self._now[:JOINTS] - self._last[:JOINTS]) / cycles
+            np.clip(step, -self._fastest, self._fastest, out=self._step[:JOINTS])
+        self._last[:] = self._now - self._step
+        self._filter[1] = self._step[: 2 * JOINTS] / self._period
+        self._filter[0] = self._last[: 2 * JOINTS] - self._lag * self._filter[1]
         self._doubted = False
         self._settling, self._known = self._settled, True
 
@@ -274,11 +332,17 @@ class ContactWatch:
         one that includes the jump would make the packets to come seem odd, without an end.
         """
         now, last, step, change, odd = self._now, self._last, self._step, self._change, self._odd
+        self._bend[:] = 0.0
         np.multiply(step, -cycles, out=odd)
         odd += change
         np.abs(odd, out=odd)
+        allowed = self._jump
+        if cycles > 1:
+            # A velocity taken for constant errs by the acceleration.
+            allowed = allowed.copy()
+            allowed[:JOINTS] += _JUMP_RAD_S2 * self._period**2 * (0.5 * cycles * (cycles + 1) - 1.0)
         # Also true for NaN.
-        jumps = not np.logical_and.reduce(np.less_equal(odd, self._jump, out=self._calm))
+        jumps = not np.logical_and.reduce(np.less_equal(odd, allowed, out=self._calm))
         if jumps and not self._doubted:
             self._doubted = True
             self._doubtful[:] = now
@@ -287,7 +351,10 @@ class ContactWatch:
             return
         self._doubted = False
         if not jumps:
-            np.divide(change[:JOINTS], cycles, out=step[:JOINTS])
+            bend = self._bend[:JOINTS]
+            if cycles > 1:
+                np.subtract(change[:JOINTS], cycles * step[:JOINTS], out=bend)
+            np.divide(change[:JOINTS] + bend, cycles, out=step[:JOINTS])
             return
         moved = (now[:JOINTS] - self._doubtful[:JOINTS]) / cycles
         if self._settling:
@@ -297,13 +364,16 @@ class ContactWatch:
         np.clip(moved, -self._fastest, self._fastest, out=step[:JOINTS])
 
     def _low_pass(self, cycles: int) -> None:
-        """Advance F from the last packet to this one, with straight lines between them."""
+        """Advance F from the last packet to this one: positions with a constant acceleration, torques straight."""
         source, ends = self._input, 2 * JOINTS
         change, last = self._change[:ends], self._last[:ends]
         for part in range(cycles):
             np.multiply(change, (2 * part + 1) / cycles, out=source)
             np.add(source, last, out=source)
             np.add(source, last, out=source)
+            if cycles > 1:
+                # The sum of both ends of the parabola, less that of the straight line.
+                source += (part**2 + (part + 1) ** 2 - (2 * part + 1) * cycles) / cycles**2 * self._bend
             self._advance.dot(self._filter, self._next)
             self._state[:] = self._next
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.errors import ConfigurationError
+from fri.errors import ConfigurationError, FileError
 from lwr_driver.arm import JOINTS
 from lwr_driver.ring import ROW
 
@@ -146,7 +146,7 @@ class Control:
             descriptor = os.memfd_create("lwr_driver", os.MFD_CLOEXEC)
             os.ftruncate(descriptor, _size(plan_rows))
         except OSError as error:
-            raise ConfigurationError(f"no shared memory for motions of {plan_rows} rows: {error}") from error
+            raise FileError.of(error, f"no shared memory for motions of {plan_rows} rows") from error
         control = cls(descriptor, plan_rows)
         control.words[Word.INDEX] = control.words[Word.ROW] = -1
         return control

@@ -26,7 +26,7 @@ from fri.states import ALL_DRIVES, Quality, State
 from fri.states import Control as ControlMode
 from lwr_driver.arm import JOINTS, ArmLimits
 from lwr_driver.commander import Commander
-from lwr_driver.contact import Contact, ContactWatch
+from lwr_driver.contact import Contact, ContactWatch, Stale
 from lwr_driver.control import BIN_NS, HISTORY, Control, Job, Mode, Result, Text, Word
 from lwr_driver.pace import Pace, Stamps
 from lwr_driver.ring import ROW, Ring
@@ -463,6 +463,12 @@ class Loop:
             watch.carry(float(load[0]), load[1:4], load[4:])
         return watch.update(elapsed, self._q, *self._torques)
 
+    @property
+    def _stale(self) -> Stale | None:
+        """A stale measurement that began in this motion; one before it is an arm that stopped at once."""
+        found = None if self._watch is None else self._watch.stale
+        return found if found is not None and found.seconds <= self._commander.index * self._period else None
+
     def _react(self, touched: Contact | None, elapsed: int, sent: bool) -> None:
         """In command mode, end a motion after a contact, or after a link rated bad for too long.
 
@@ -474,6 +480,9 @@ class Loop:
         if touched is not None:
             what = f"contact: {touched.describe(self._settings.joint_names)}"
             self._alarm = partial(commander.touch, what, touched.advice)
+        elif self._alarm is None and commander.mode is Mode.MOTION and self._stale is not None:
+            what = f"{self._stale.describe(self._settings.joint_names)} {commander.place()}; {self._stale.advice}"
+            self._alarm = partial(commander.stop, Result.ROBOT, what)
         elif (
             self._alarm is None
             and commander.mode is Mode.MOTION

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri import interpreter
-from fri.errors import ConfigurationError, LwrError, NetworkError
+from fri.errors import ConfigurationError, FileError, LwrError, NetworkError
 from fri.in_process import Network
 from lwr_driver import realtime
 from lwr_driver.arm import ArmLimits
@@ -94,7 +94,7 @@ class LoopProcess:
             )
         except OSError as error:
             self._errors.close()
-            raise ConfigurationError(f"the loop process cannot be started: {error}") from error
+            raise FileError.of(error, "the loop process cannot be started") from error
         try:
             answer = self._ready()
         except BaseException:

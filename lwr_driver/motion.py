@@ -201,9 +201,10 @@ def move_to(
         outside = np.maximum(limits.q_low - q, q - limits.q_high)
         joint = int(np.argmax(outside))
         if outside[joint] > 1e-6:
+            advice = "move the arm inside by hand" if name == "start" else "choose a goal inside, in rad"
             raise RefusedError(
                 f"{name} of {phase}: {arm.joint_names[joint]} {q[joint]:.4f} rad is outside "
-                f"{limits.q_low[joint]:.4f} to {limits.q_high[joint]:.4f}; move the arm inside by hand"
+                f"{limits.q_low[joint]:.4f} to {limits.q_high[joint]:.4f} rad; {advice}"
             )
     if np.array_equal(ends[0], ends[1]):
         return Motion(ends, period_s, ((0, phase),))

@@ -21,7 +21,7 @@ from types import FrameType
 from typing import Any
 
 from fri import interpreter
-from fri.errors import ConfigurationError, DataError, LwrError
+from fri.errors import ConfigurationError, DataError, FileError, LwrError
 from lwr_driver.ring import Ring
 from lwr_driver.session.recording import Recorded, Recording, SessionRequest, utc_offset_ns
 from lwr_driver.session.writer import ExitStatus
@@ -86,7 +86,7 @@ class Recorder:
             )
         except OSError as error:
             mine.close()
-            raise ConfigurationError(f"the recorder process cannot be started: {error}") from error
+            raise FileError.of(error, "the recorder process cannot be started") from error
         finally:
             theirs.close()
         try:

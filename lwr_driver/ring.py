@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.errors import ConfigurationError
+from fri.errors import ConfigurationError, FileError
 from fri.packets import CMD, MSR
 
 CAPACITY = 8192
@@ -102,9 +102,7 @@ class Ring:
         except OSError as error:
             if descriptor >= 0:
                 os.close(descriptor)
-            raise ConfigurationError(
-                f"shared memory of {size / 1e6:.1f} MB cannot be had: {error}; end other programs"
-            ) from error
+            raise FileError.of(error, f"shared memory of {size / 1e6:.1f} MB cannot be had") from error
 
     @classmethod
     def attach(cls, name: str) -> Ring:

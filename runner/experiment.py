@@ -85,7 +85,7 @@ class ExperimentProgress:
             return progress
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise DataError(
-                f"{path}: cannot be read: {error}; delete it to start the experiment anew"
+                f"{path}: cannot be read, {type(error).__name__}: {error}; delete it to start the experiment anew"
             ) from error
 
     @classmethod

@@ -14,7 +14,7 @@ import click
 
 from fri.errors import ConfigurationError, DataError
 from runner.status import write
-from runner.terminal import ask
+from runner.terminal import FiniteRange, ask
 
 if TYPE_CHECKING:
     from ident.import_log import Guess
@@ -44,7 +44,7 @@ def guess_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option(
             "--rate-hz",
-            type=click.FloatRange(min=0, min_open=True),
+            type=FiniteRange(min=0, min_open=True),
             help="Rate of a recording without times.",
         ),
         click.option(

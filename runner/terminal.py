@@ -55,6 +55,17 @@ class InputPath(click.Path):
             raise FileError.of(error, f"{path} cannot be read") from error
 
 
+class FiniteRange(click.FloatRange):
+    """A finite number within a range."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number; `nan` and `inf` are refused."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{number} is no finite number.", param, ctx)
+        return number
+
+
 PATH = InputPath()
 NAMED_FILE = click.Path()
 """A file of that path, or of that name in `configs/`; the shell completes files."""

@@ -4,7 +4,8 @@ Every body is one or more capsules (segments with a radius) around its collision
 is the distance of their segments less the radii. Its derivative follows from the nearest points alone (envelope
 theorem): a unit force pair along the connecting line, turned into joint torques.
 
-A capsule encloses its shape wholly, so capsules apart mean shapes apart. These distances steer the optimisation; the
+A capsule encloses its shape wholly, so capsules apart mean shapes apart. At the wrist, where the payload is too near
+for that, the limit is eased by what the capsules stick out of the shapes. These distances steer the optimisation; the
 verdict comes from the collision checker with the shapes themselves.
 """
 
@@ -23,6 +24,7 @@ from ident.excitation.motions import Array
 
 _FAR = 0.15
 _RIM = 0.4  # distance of the segment's end from the flat end of a cylinder, as a share of the radius
+_NEAR_JOINTS = 2  # between the payload and the last link that it is kept apart from
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +35,8 @@ class Space:
     ends (c, 2, 3): ends of its segment in this frame [m]; thickness (c,): its radius [m]
     pairs (p, 2): capsules to be kept apart
     ground : height of the ground in frame 0 [m] (-inf: none); grounded (g,): capsules kept above it
+    eased : rows of the payload beside the wrist, and by how much both capsules stick out of their shapes [m]; they
+        would never be apart by the clearance
     boxes : half sizes (b, 3), placements (b, 3, 3), (b, 3) in frame 0; boxed (k, 2): (capsule, box) pairs
     """
 
@@ -46,6 +50,7 @@ class Space:
     box_rotation: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     box_centre: Array = field(default_factory=lambda: np.zeros((0, 3)))
     boxed: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    eased: tuple[tuple[int, float], ...] = ()
 
     @property
     def rows(self) -> int:
@@ -56,6 +61,8 @@ class Space:
         """Least distance of each row [m]: bounds of the flange (None: no bound) plus a reserve, then the clearance."""
         floor = np.full(self.rows, clearance)
         floor[:2] = [-np.inf if bound is None else bound + reserve for bound in flange]
+        for row, excess in self.eased:
+            floor[row] -= excess
         return floor
 
     def extents(self, joints: int) -> Array:
@@ -70,7 +77,7 @@ class Space:
     @property
     def shapes(self) -> tuple:
         """The fields in the order of the compiled functions."""
-        return tuple(getattr(self, item.name) for item in fields(self))
+        return tuple(getattr(self, item.name) for item in fields(self) if item.name != "eased")
 
 
 @njit(cache=True, error_model="numpy")
@@ -355,6 +362,15 @@ def enclose(shape: coal.CollisionGeometry) -> tuple[Array, float]:
     return _centred(axis, half - inset), float(np.hypot(radius, inset))
 
 
+def _excess(shape: coal.CollisionGeometry) -> float:
+    """How far the capsule around a shape sticks out of its flat ends [m]."""
+    if isinstance(shape, (coal.Sphere, coal.Capsule)):
+        return 0.0
+    segment, radius = enclose(shape)
+    half = max(shape.halfSide) if isinstance(shape, coal.Box) else shape.halfLength
+    return float(np.linalg.norm(segment[1]) + radius - half)
+
+
 def _centred(axis: Array, half: float) -> Array:
     return np.stack([-half * axis, half * axis])
 
@@ -376,6 +392,7 @@ def space_of(mechanism: Mechanism, geometry: pin.GeometryModel | None) -> tuple[
     grounded: list[tuple[int, str]] = []
     boxed: list[tuple[tuple[int, int], str]] = []
     ground = -np.inf
+    eased: list[tuple[int, float]] = []
 
     def capsule(index: int) -> int:
         if index not in capsules:
@@ -407,6 +424,9 @@ def space_of(mechanism: Mechanism, geometry: pin.GeometryModel | None) -> tuple[
             place = list(boxes).index(indices[solid[0]])
             boxed.append(((capsule(indices[1 - solid[0]]), place), label))
         else:
+            near = abs(int(shapes[0].parentJoint) - int(shapes[1].parentJoint)) <= _NEAR_JOINTS
+            if near and "payload" in (shapes[0].name, shapes[1].name):
+                eased.append((2 + len(pairs), sum(_excess(shape.geometry) for shape in shapes)))
             pairs.append(((capsule(indices[0]), capsule(indices[1])), label))
     space = Space(
         body=np.array([body for body, _, _ in capsules.values()], dtype=np.int64),
@@ -419,5 +439,6 @@ def space_of(mechanism: Mechanism, geometry: pin.GeometryModel | None) -> tuple[
         box_rotation=np.ascontiguousarray([pose[:3, :3] for _, pose in boxes.values()]).reshape(-1, 3, 3),
         box_centre=np.array([pose[:3, 3] for _, pose in boxes.values()]).reshape(-1, 3),
         boxed=np.array([row for row, _ in boxed], dtype=np.int64).reshape(-1, 2),
+        eased=tuple(eased),
     )
     return space, (*names, *(label for _, label in (*pairs, *grounded, *boxed)))

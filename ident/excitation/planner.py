@@ -400,8 +400,8 @@ def feasible_fourier(
         blocked[f"{worst.subject} {worst.constraint}"] += 1
     culprit = blocked.most_common(1)[0][0]
     raise RefusedError(
-        f"no feasible exciting motion found from {_STARTS} random starts; most frequent obstacle: {culprit}; widen "
-        "that limit or choose another seed"
+        f"no feasible exciting motion found from {_STARTS} random starts; most frequent obstacle: {culprit}; choose "
+        "another `seed`, a longer `period_s`, or a smaller `speed_scale` or `clearance_m`"
     )
 
 

@@ -231,6 +231,9 @@ def tighten(constraints: Constraints, check: Check, joint_names: tuple[str, ...]
             constraints.torque_limit[joint] *= 1.0 - _SHARE_STEP - 1.2 * share
         else:
             rows = {"distance from axis 1": [0], "height": [1]}.get(margin.constraint)
+            eased = [row for row, _ in constraints.space.eased]
             if rows is None:
-                rows = list(range(2, constraints.space.rows))
+                rows = (
+                    eased if "payload" in margin.subject and eased else list(range(2, constraints.space.rows))
+                )
             constraints.floor[rows] += _SPACE_STEP + 1.2 * short

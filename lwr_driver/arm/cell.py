@@ -71,6 +71,10 @@ class Cell:
         names = [box.name for box in self.boxes]
         if len(set(names)) != len(names):
             raise ConfigurationError(f"box names {names} are not unique")
+        for taken in {"ground", "payload"}.intersection(names):
+            raise ConfigurationError(
+                f"box name {taken!r} means another body in every message; choose another name"
+            )
 
     @classmethod
     def load(cls, name: str | Path = CONFIGS / "cell.yaml", *, beside: Path | None = None) -> Cell:

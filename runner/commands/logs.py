@@ -10,7 +10,17 @@ from fri.errors import ConfigurationError
 from lwr_driver.listing import Listing
 from runner.output import OUTPUT_FILE, OUTPUT_FOLDER, check_file, check_folder, default_output, set_aside
 from runner.status import answer
-from runner.terminal import NAMED_FILE, PATH, forced, implied, json_option, tell, to_json, verb
+from runner.terminal import (
+    NAMED_FILE,
+    PATH,
+    FiniteRange,
+    forced,
+    implied,
+    json_option,
+    tell,
+    to_json,
+    verb,
+)
 
 
 @verb("info")
@@ -59,7 +69,7 @@ def recover_command(session: Path, out: Path | None, as_json: bool) -> None:
 @click.argument("trace", type=PATH)
 @click.option("--out", type=OUTPUT_FILE, help="New file; default with --force: SESSION itself.")
 @click.option(
-    "--tolerance-ms", type=click.FloatRange(min=0.0, min_open=True), help="Largest accepted timing error."
+    "--tolerance-ms", type=FiniteRange(min=0.0, min_open=True), help="Largest accepted timing error."
 )
 @json_option
 def attach_command(
@@ -105,7 +115,12 @@ def _rows(context: click.Context, parameter: click.Parameter, value: str | None)
 @click.argument("output", type=OUTPUT_FILE)
 @click.option("--rows", callback=_rows, metavar="A:B", help="Rows A to B-1 only, counted from 0.")
 @click.option("--payload", help="Name of the payload; `none`: the bare arm.")
-@click.option("--payload-mass", type=float, metavar="KG", help="Weighed mass of the payload.")
+@click.option(
+    "--payload-mass",
+    type=FiniteRange(0.0, 1000.0, min_open=True),
+    metavar="KG",
+    help="Weighed mass of the payload.",
+)
 @click.option("--serial", help="Serial number of the arm.")
 @click.option("--urdf", type=PATH, help="URDF of the arm, instead of the mapping's.")
 @click.option("--base", metavar="LINK", help="First link of the arm; gravity points down in its axes.")

@@ -10,7 +10,7 @@ import click
 
 from runner.output import OUTPUT_FILE
 from runner.status import answer
-from runner.terminal import NAMED_FILE, PATH, forced, json_option, to_json, verb
+from runner.terminal import NAMED_FILE, PATH, FiniteRange, forced, json_option, to_json, verb
 
 
 @verb("validate")
@@ -98,7 +98,7 @@ def validate_command(
 @json_option
 @click.option(
     "--level",
-    type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+    type=FiniteRange(0.0, 1.0, min_open=True, max_open=True),
     default=0.05,
     show_default=True,
     help="Probability of any false difference.",

@@ -10,7 +10,16 @@ from lwr_driver.configuration import CONFIGS
 from runner import status
 from runner.output import OUTPUT_FILE, default_output
 from runner.status import StatusLine
-from runner.terminal import NAMED_FILE, default_file, forced, hold_json, json_option, to_json, verb
+from runner.terminal import (
+    NAMED_FILE,
+    FiniteRange,
+    default_file,
+    forced,
+    hold_json,
+    json_option,
+    to_json,
+    verb,
+)
 
 
 @verb("plan")
@@ -54,7 +63,7 @@ def plan_command(file: str, out: Path | None, as_json: bool) -> None:
 
 @verb("check")
 @click.argument("file", type=NAMED_FILE, default=default_file)
-@click.option("--period-ms", default=5.0, show_default=True, type=click.FloatRange(1, 100), help="FRI cycle.")
+@click.option("--period-ms", default=5.0, show_default=True, type=FiniteRange(1, 100), help="FRI cycle.")
 @json_option
 def check_command(file: str, period_ms: float, as_json: bool) -> None:
     """Check the experiment FILE without motion: limits, torques, collisions, from the home position.

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.output import OUTPUT_FILE
-from runner.terminal import NAMED_FILE, PATH, json_option, to_json, verb
+from runner.terminal import NAMED_FILE, PATH, FiniteRange, json_option, to_json, verb
 
 
 @verb("replay")
@@ -17,12 +17,12 @@ from runner.terminal import NAMED_FILE, PATH, json_option, to_json, verb
 @click.option("--extended", type=PATH, help="Extended model; default: that of the diagnosis beside the log.")
 @click.option("--arm", type=NAMED_FILE, help="Arm file; default: the one with the joints of the model.")
 @click.option(
-    "--longest-s", default=20.0, show_default=True, type=click.FloatRange(2.0, 600.0), help="Simulated part."
+    "--longest-s", default=20.0, show_default=True, type=FiniteRange(2.0, 600.0), help="Simulated part."
 )
 @click.option("--port", default=8080, show_default=True, type=click.IntRange(1, 65535), help="Of the page.")
 @click.option("--out", type=OUTPUT_FILE, help="Write a video, .mp4 or .gif, instead of serving a page.")
 @click.option(
-    "--length-s", default=10.0, show_default=True, type=click.FloatRange(0.5, 300.0), help="Of the video."
+    "--length-s", default=10.0, show_default=True, type=FiniteRange(0.5, 300.0), help="Of the video."
 )
 @json_option
 def command(

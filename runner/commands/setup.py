@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from contextlib import ExitStack
+from pathlib import Path
 
 import click
 from click.shell_completion import get_completion_class
@@ -12,26 +13,26 @@ from click.shell_completion import get_completion_class
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import CONFIGS
 from runner.status import StatusLine, write
-from runner.terminal import NAMED_FILE, default_file, json_option, tell, verb
+from runner.terminal import NAMED_FILE, PATH, FiniteRange, default_file, json_option, tell, verb
 
 
 @verb("doctor")
 @click.argument("file", type=NAMED_FILE, default=default_file)
 @click.option("--link", is_flag=True, help="Test the link too: answer the controller in monitor mode.")
 @click.option(
-    "--seconds", default=10.0, show_default=True, type=click.FloatRange(0.5), help="Length of the test."
+    "--seconds", default=10.0, show_default=True, type=FiniteRange(0.5, 3600.0), help="Length of the test."
 )
 @click.option(
     "--wait",
     "wait_s",
     default=20.0,
     show_default=True,
-    type=click.FloatRange(0.1),
+    type=FiniteRange(0.1, 86400.0),
     help="For the first packet [s].",
 )
 @click.option("--address", help="Address of this computer, for a real controller; default: from FILE.")
 @click.option("--port", type=click.IntRange(1, 65535), help="UDP port; default: from FILE.")
-@click.option("--period-ms", type=click.FloatRange(1, 100), help="Cycle of the built-in emulator.")
+@click.option("--period-ms", type=FiniteRange(1, 100), help="Cycle of the built-in emulator.")
 @json_option
 def doctor_command(
     file: str,
@@ -112,7 +113,7 @@ def _is_error(record: logging.LogRecord) -> bool:
 @click.option(
     "--pendant-port", default=0, type=click.IntRange(0, 65535), help="Port of the pendant; 0: any free port."
 )
-@click.option("--period-ms", type=click.FloatRange(1, 100), help="FRI cycle; default: as configured.")
+@click.option("--period-ms", type=FiniteRange(1, 100), help="FRI cycle; default: as configured.")
 @click.option("--program", type=NAMED_FILE, help="KRL program: a name of configs/krl, or a .src file.")
 @click.option(
     "--set",
@@ -156,6 +157,12 @@ def emulator_command(
     from sim_backend.configuration import read_settings
     from sim_backend.process import EmulatorProcess
 
+    if program is not None and program.lower().endswith(".src"):
+        # As every file of a command line, in the working folder; else beside the configuration.
+        if not Path(config).with_name(program).is_file():
+            PATH.require(Path(program))
+        if Path(program).is_file():
+            program = str(Path(program).resolve())
     emulator = EmulatorProcess(
         config,
         lock_step=lock_step,

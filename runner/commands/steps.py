@@ -13,7 +13,7 @@ import click
 from fri.errors import ConfigurationError, OperatorError
 from runner.output import NEW_FILE, check_folder
 from runner.status import StatusLine, answer
-from runner.terminal import NAMED_FILE, PATH, ask, default_file, implied, json_option, tell, verb
+from runner.terminal import NAMED_FILE, PATH, FiniteRange, ask, default_file, implied, json_option, tell, verb
 
 if TYPE_CHECKING:
     from runner.experiment_file import Experiment
@@ -45,7 +45,7 @@ speed_option = click.option(
     "--speed",
     default=_SPEED,
     show_default=True,
-    type=click.FloatRange(0.0, 0.5, min_open=True),
+    type=FiniteRange(0.0, 0.5, min_open=True),
     help="Share of the velocity limits.",
 )
 
@@ -119,7 +119,7 @@ def _tell(order: _Order, step: Step, *more: str) -> None:
 
 @verb("record")
 @click.argument("file", type=NAMED_FILE, default=default_file)
-@click.option("--seconds", type=click.FloatRange(0.1), help="Length; default: until Ctrl-C.")
+@click.option("--seconds", type=FiniteRange(0.1, 86400.0), help="Length; default: until Ctrl-C.")
 @out_option
 @click.option(
     "--poses",
@@ -170,7 +170,7 @@ def _write_poses(path: Path, step: Step) -> None:
     "--seconds",
     default=5.0,
     show_default=True,
-    type=click.FloatRange(0.5, 3600.0),
+    type=FiniteRange(0.5, 3600.0),
     help="Time in command mode.",
 )
 @_step_options
@@ -198,7 +198,7 @@ def hold_command(
 
 @verb("jog", context_settings={"ignore_unknown_options": True})
 @click.argument("joint", callback=_no_option)
-@click.argument("degrees", type=float)
+@click.argument("degrees", type=FiniteRange())
 @click.argument("file", type=NAMED_FILE, default=default_file, callback=_no_option)
 @speed_option
 @_step_options
@@ -287,7 +287,9 @@ def _read_pose(path: Path, name: str | None, joints: int) -> Any:
         listed = ", ".join(map(str, known)) if isinstance(known, dict) else "none"
         raise ConfigurationError(f"{path}: no pose {name or 'moves.home'}; poses there: {listed}") from error
     if q.shape != (joints,) or not np.all(np.isfinite(q)) or np.abs(q).max() > 2.0 * np.pi:
+        degrees = q.shape == (joints,) and 2.0 * np.pi < np.abs(q).max() <= 360.0
         raise ConfigurationError(
             f"{path}: pose {name or 'moves.home'} must be {joints} joint positions in rad"
+            + ("; these look like deg" if degrees else "")
         )
     return q

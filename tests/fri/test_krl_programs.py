@@ -263,3 +263,18 @@ def test_a_motion_of_krl_in_command_mode_is_superposed_by_the_client() -> None:
     assert session.to_int[0] == -1
     assert session.counters()["drops"] == 0
     assert session.setpoint[0] == pytest.approx(40 * DEG, abs=1e-4)
+
+
+def test_a_nudge_of_the_third_joint_alone_moves_it() -> None:
+    bench = Bench("DEF labor()\nPTP_REL {E1 0.5}\nPTP_REL {X 5.0, E1 0.5}\nEND")
+    moved = np.degrees(np.ptp(bench.cycles(2000), axis=0))
+    assert moved == pytest.approx([0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0], abs=1e-3)
+    assert [remark for remark in bench.machinery.said if "line 2" in remark] == []
+
+
+def test_signals_and_global_kinds_of_a_data_list_are_plain_variables() -> None:
+    data = "DEFDAT labor PUBLIC\nGLOBAL ENUM KIND FIRST,SECOND\nGLOBAL SIGNAL LAMP $OUT[1]\nENDDAT"
+    body = "SIGNAL SPEED $OUT[1] TO $OUT[4]\nLAMP=TRUE\nSPEED=3\nr=friShow()\nIF LAMP THEN\n$FRI_TO_INT[3]=SPEED\nENDIF"
+    bench = Bench(f"DEF labor()\nDECL FRISTATE r\n{body}\nEND", data)
+    bench.cycles(20)
+    assert bench.rig.session.to_int[2] == 3

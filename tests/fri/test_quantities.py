@@ -50,6 +50,10 @@ def test_values_within_their_ranges_pass() -> None:
             {"place": (0.0, -66.0, 144.0)},
             r"`place`\[1\]: .*looks like mm; write it in m: \[0, -0.066, 0.144\]",
         ),
+        (
+            {"place": (0.0, -6.6, 14.4)},
+            r"looks like mm or cm; write it in m: \[0, -0.0066, 0.0144\] or \[0, -0.066, 0.144\]",
+        ),
         ({"place": (0.0, 1e9, 0.0)}, r"`place`\[1\]: .*give a value in this range"),
         ({"speed": 50.0}, "`speed`: .*looks like percent; write it as a share of 1: 0.5"),
         ({"name": ""}, "`name`: 0 characters, limits 1 and 8; give more"),

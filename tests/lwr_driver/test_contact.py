@@ -215,19 +215,89 @@ def test_a_damaged_gravity_torque_is_no_contact_and_no_payload():
     assert max(np.abs(external).max(), np.abs(later).max()) < 3.0
 
 
-def test_lost_packets_are_bridged():
-    q, qd, qdd = swing(1e-3)
+@pytest.mark.parametrize(
+    ("period_s", "lost"), [(1e-3, range(3, 6)), (10e-3, range(3, 6)), (5e-3, range(8, 14))]
+)
+def test_lost_packets_are_bridged(period_s, lost):
+    q, qd, qdd = swing(period_s)
     tau = torques(model(), q, qd, qdd)
-    made, last = watch(), 0
+    made, last = watch(period_s=period_s), 0
     for row in range(len(q)):
-        if row % 7 in (3, 4, 5):
+        if row % (lost.stop + 1) in lost:
             continue
         contact = made.update(
             row - last if row else 1, q[row].astype(np.float32), tau[row].astype(np.float32), NOTHING, NOTHING
         )
         assert contact is None
         last = row
-        assert np.abs(made.external).max() < 3.0
+        # A constant acceleration over the gap errs by the jerk.
+        assert np.abs(made.external).max() < (3.0 if period_s == 1e-3 else 7.0)
+
+
+@pytest.mark.parametrize("period_s", [1e-3, 2e-3, 5e-3, 10e-3])
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_frozen_measurement_is_told_as_stale_and_no_contact(period_s, whole):
+    q, qd, qdd = swing(period_s)
+    tau = torques(model(), q, qd, qdd)
+    first = round(0.7 / period_s)
+    frozen = slice(first, first + max(3, round(30e-3 / period_s)))
+    q[frozen] = q[first - 1]
+    if whole:
+        tau[frozen] = tau[first - 1]
+    made, stale = watch(period_s=period_s), []
+    for row in range(len(q)):
+        assert follow(made, q[row : row + 1], tau[row : row + 1])[0] == [None]
+        stale.append(made.stale)
+    told = next(row for row, each in enumerate(stale) if each is not None)
+    assert told == first + max(3, round(10e-3 / period_s)) - 1
+    found = stale[told]
+    assert found is not None
+    assert abs(found.velocity) == pytest.approx(np.abs(qd[first - 1, found.joint]).max(), rel=0.1)
+    assert stale[frozen.stop] is None
+
+
+@pytest.mark.parametrize("period_s", [1e-3, 5e-3])
+def test_a_position_repeated_for_a_packet_or_two_is_bridged(period_s):
+    q, qd, qdd = swing(period_s)
+    tau = torques(model(), q, qd, qdd)
+    for row in range(20, len(q) - 2, 25):
+        q[row : row + 2] = q[row - 1]
+    made = watch(period_s=period_s)
+    found, external = follow(made, q, tau)
+    assert found == [None] * len(q)
+    assert np.abs(external).max() < 6.0
+
+
+def test_a_push_is_found_while_the_position_is_repeated():
+    q, qd, qdd = swing(1e-3)
+    tau = torques(model(), q, qd, qdd)
+    estimate = np.zeros_like(q)
+    q[700:705], estimate[700:, 1] = q[699], 30.0
+    found, _ = follow(watch(), q, tau, estimate)
+    told = next(row for row, contact in enumerate(found) if contact is not None)
+    assert told <= 706
+
+
+def test_an_arm_at_rest_does_not_repeat_its_position():
+    q = np.tile(HOME, (1500, 1))
+    q[:100, 0] += 1e-3 * np.arange(-100, 0)
+    tau = torques(model(), q, 0.0 * q, 0.0 * q)
+    made = watch()
+    follow(made, q[:1200], tau[:1200])
+    assert made.stale is None
+    assert not any(follow(made, q[1200:], tau[1200:])[0])
+
+
+def test_packets_lost_for_longer_in_motion_are_no_contact():
+    q, qd, qdd = swing(1e-3)
+    tau = torques(model(), q, qd, qdd)
+    made = watch()
+    assert not any(follow(made, q[:700], tau[:700])[0])
+    row = [value.astype(np.float32) for value in (q[740], tau[740])]
+    assert made.update(41, *row, NOTHING, NOTHING) is None
+    found, external = follow(made, q[741:], tau[741:])
+    assert not any(found)
+    assert np.abs(external).max() < 6.0
 
 
 def test_an_estimate_that_is_no_number_is_a_contact():

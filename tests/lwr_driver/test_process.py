@@ -89,7 +89,7 @@ class Lab:
 
         motion = self.hop(0.1)
         outcome = self.driver.execute(motion, progress)
-        assert done
+        assert done, (outcome.status, outcome.reason)
         return outcome
 
     def check_commands(self) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from fri.states import EventKind, Quality, State
 from lwr_driver.commander import CONTACT, RETREAT
-from lwr_driver.contact import Contact
+from lwr_driver.contact import Contact, Stale
 from lwr_driver.control import Mode, Result, Text, Word
 from lwr_driver.loop import _UNACCEPTABLE_PACKETS
 from lwr_driver.motion import Motion, move_to
@@ -25,6 +25,7 @@ class Hand:
     def __init__(self) -> None:
         self.external, self.allowed = np.zeros(7), np.full(7, 10.0)
         self.contact: Contact | None = None
+        self.stale: Stale | None = None
         self.carried: list[float] = []
 
     def set_period(self, period_s: float) -> None:
@@ -279,6 +280,27 @@ def test_contact_in_the_packet_that_begins_a_motion_ends_it(rig):
 # -- quality -----------------------------------------------------------------------------------------------------
 
 LENIENT = {"hold_quality": Quality.UNACCEPTABLE}
+
+
+def test_stale_measurement_ends_the_motion_by_its_own_name(rig):
+    r = rig()
+    in_motion(r)
+    hand(r).stale = Stale(1, 0.015, 0.93)
+    r.cycle()
+    assert r.mode is Mode.STOP
+    assert r.until_done() is Result.ROBOT
+    assert r.reason.startswith(
+        "stale measurement: A2 measured position has not changed for 0.015 s at 0.93 rad/s at row "
+    )
+    assert "contact" not in r.reason
+    check_sent(r)
+
+
+def test_an_arm_that_stopped_at_once_before_the_motion_is_no_stale_measurement(rig):
+    r = rig()
+    hand(r).stale = Stale(1, 0.45, 0.09)
+    in_motion(r, 20)
+    assert r.mode is Mode.MOTION
 
 
 def test_unacceptable_quality_in_command_mode_stops_the_motion(rig):

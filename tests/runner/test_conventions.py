@@ -43,6 +43,7 @@ MISSING = (
     "report none",
     "report none --figures paper",
     "emulator none.yaml",
+    "emulator --program none.src",
     "identify none.mcap",
     "validate none.yaml none.mcap",
     "commission none.mcap --out m.yaml",
@@ -347,3 +348,47 @@ def test_verdict_words_of_a_table_have_their_colour(monkeypatch: pytest.MonkeyPa
     status.write(Listing(("", "condition"), rows), stream=stream)
     assert "\x1b[32mok" in stream.getvalue()
     assert "\x1b[1;31mFAIL" in stream.getvalue()
+
+
+def _numbers() -> list[tuple[str, click.Parameter]]:
+    context = click.Context(main)
+    commands = {verb: main.get_command(context, verb) for verb in VERBS}
+    return [
+        (verb, param)
+        for verb, command in commands.items()
+        if command is not None
+        for param in command.params
+        if isinstance(param.type, click.types.FloatParamType)
+    ]
+
+
+def test_numbers_of_every_command_are_finite():
+    numbers = _numbers()
+    assert len(numbers) > 8
+    for verb, param in numbers:
+        for text in ("nan", "inf", "-inf"):
+            with pytest.raises(click.BadParameter, match=r"no finite number|not in the range"):
+                param.type.convert(text, param, None)
+            assert verb
+
+
+def test_a_program_of_the_command_line_lies_in_the_working_folder(tmp_path, monkeypatch):
+    asked = []
+
+    class Emulator:
+        def __init__(self, config, settings, **_):
+            asked.append(settings["fri.program"])
+            raise FileNotFoundError(2, "no emulator here")
+
+    monkeypatch.setattr("sim_backend.process.EmulatorProcess", Emulator)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_lab.src").write_text("DEF my_lab( )\nEND\n")
+    (tmp_path / "cell").mkdir()
+    for name in ("arm.yaml", "beside.src"):
+        (tmp_path / "cell" / name).write_text("")
+    for line in ("--program my_lab.src", "--program rcprg", "cell/arm.yaml --program beside.src"):
+        CliRunner().invoke(main, ["emulator", *line.split()])
+    assert asked == [str(tmp_path / "my_lab.src"), "rcprg", "beside.src"]
+    result = CliRunner().invoke(main, ["emulator", "--program", "my_lap.src"])
+    assert result.exit_code == 2
+    assert "did you mean my_lab.src?" in result.output

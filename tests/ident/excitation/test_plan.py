@@ -10,6 +10,8 @@ from fri.errors import ConfigurationError, RefusedError
 from ident.excitation import ExcitationPlan, Workspace, arm_limits, check_motion, feasible_fourier
 from ident.excitation.arm_model import ArmEstimate, Mechanism, tip_path
 from lwr_driver.arm import Arm
+from lwr_driver.arm.cell import Cell, PayloadShape
+from lwr_driver.arm.collision import CollisionChecker
 
 
 @pytest.fixture(scope="module")
@@ -112,3 +114,20 @@ def test_the_collision_checker_decides(arm: Arm) -> None:
 
     with pytest.raises(RefusedError, match="link_2 and table clearance"):
         feasible_fourier(arm, Blocked(), seed=1)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        PayloadShape("box", (0.10, 0.10, 0.12), (0.0, -0.05, 0.14)),
+        PayloadShape("cylinder", (0.03, 0.10), (0.0, 0.0, 0.13)),
+    ],
+)
+def test_a_payload_on_the_flange_leaves_a_motion(arm: Arm, shape: PayloadShape) -> None:
+    checker = CollisionChecker(arm, Cell.load(), shape)
+    plan = feasible_fourier(
+        arm, checker, period_s=10.0, harmonics=3, speed_scale=0.3, seed=2, clearance_m=0.03
+    )
+    assert plan.check.ok
+    nearest = min(checker.clearance(q).distance for q in plan.sample(np.arange(0.0, 10.0, 0.1)).q)
+    assert nearest >= 0.03
