@@ -259,11 +259,11 @@ def habit(
     count = np.isfinite(values).sum(axis=0)
     mean, own = np.nanmean(values, axis=0), np.nanmean([np.diag(c) for c in covariances], axis=0)
     symbols = [_symbol(name) for name in names]
+    # With motor torques alone their rows show the offsets of the links' friction.
+    sides = {"offm": "motor", "offl": "joint" if "joint" in torque_rms else "motor"}
     scale = np.array(
         [
-            float(torque_rms["motor" if symbol == "offm" else "joint"][_joint(name)])
-            if symbol in _OFFSETS
-            else abs(value)
+            float(torque_rms[sides[symbol]][_joint(name)]) if symbol in _OFFSETS else abs(value)
             for name, symbol, value in zip(names, symbols, mean, strict=True)
         ]
     )

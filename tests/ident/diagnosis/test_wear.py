@@ -129,6 +129,8 @@ def test_habit_of_an_offset_is_measured_by_the_torque_of_its_rows() -> None:
     rms = {"motor": np.array([10.0]), "joint": np.array([20.0])}
     found = habit(names, [np.zeros(2)], [np.eye(2) * 1e-8], rms)
     assert np.sqrt(found) == pytest.approx([0.1, 0.2])
+    alone = habit(names[1:], [np.zeros(1)], [np.eye(1) * 1e-8], {"motor": rms["motor"]})
+    assert np.sqrt(alone) == pytest.approx([0.1])
 
 
 def test_slow_motor_samples_leave_a_drive_inertia_uncertain_by_their_phase(
