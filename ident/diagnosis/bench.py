@@ -13,17 +13,18 @@ from ident.diagnosis.evidence import Evidence, Floats
 from ident.diagnosis.noise import noise_floor, repeatability
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal, NominalArm, structure_of
 from ident.diagnosis.recording import SessionRecord
-from ident.diagnosis.reference import Reference
+from ident.diagnosis.reference import Reference, joint_of, symbol_of
 from ident.diagnosis.selection import Selection, gain_rows
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.structure import Coupling
+from ident.dynamics.structure import Coupling, Side
 from ident.effects import DELAYS, ELASTICITY, Shape
 from ident.estimators.physical import cad_prior
 
 _BySide = dict[str, Floats]
 _SLOW_S = 0.1
+# Sides of the parameters of friction in units of torque.
+_BORNE: dict[str, Side] = {"Fcl": "joint", "offl": "joint", "Fcm": "motor", "offm": "motor"}
 # Relative standard deviation of a stiffness from the literature, and largest relative change in a step.
 _UNSURE, _LARGEST_STEP = 0.5, 0.35
 _FACTORS = (0.5, 0.7, 1.0, 1.4)
@@ -108,7 +109,7 @@ def prepare_bench(
         arm = _roughly_stiff(arm, recordings, settings, reference)
     structure, base = structure_of(arm, recordings)
     nominal = Nominal(arm, recordings, settings, structure, base)
-    prior = _drawn(base) if reference is None else reference.prior(base, nominal.masses)
+    prior = _drawn(nominal) if reference is None else reference.prior(base, nominal.masses)
     fitted = fit_compliance and np.any(arm.compliance > 0.0) and len(nominal.rows) == 2
     # Predictions of the second round include the reference; a third changes nothing.
     rounds = 3 if fitted else 2 if reference is not None else 1
@@ -125,12 +126,26 @@ def prepare_bench(
     return DiagnosisBench(nominal, evidence, Dictionary(nominal, evidence, causes), repeatable)
 
 
-def _drawn(base: BaseSet) -> tuple[Floats, Floats] | None:
-    """Precision (p, p) and values (p,) of the base parameters from the arm's drawing; None without its inertia."""
-    if base.structure.chain.urdf is None:
-        return None
-    prior = cad_prior(base).prior("pullback")
-    return prior.precision, prior.mean
+def _drawn(nominal: Nominal) -> tuple[Floats, Floats]:
+    """Precision (p, p) and values (p,) of the base parameters from the arm's drawing, where it has inertia.
+
+    Coulomb friction and offsets are within the torque that a joint bears. A joint that never reverses shows only their
+    sum.
+    """
+    base = nominal.base
+    precision, mean = np.zeros((len(base), len(base))), np.zeros(len(base))
+    if base.structure.chain.urdf is not None:
+        prior = cad_prior(base).prior("pullback")
+        precision, mean = prior.precision.copy(), prior.mean
+    for k, name in enumerate(base.names):
+        side = _BORNE.get(symbol_of(name))
+        if side is None:
+            continue
+        rows, joint = nominal.rows.get(side) or next(iter(nominal.rows.values())), joint_of(name)
+        torque = rows.target[rows.valid[:, joint], joint]
+        if np.any(torque):
+            precision[k, k] += 1.0 / float(np.mean(torque**2))
+    return precision, mean
 
 
 def _evidence(

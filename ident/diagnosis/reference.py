@@ -202,7 +202,7 @@ class Reference:
         model = self.model
         if model.covariance is None:
             return self
-        mine = np.array([_symbol(name) == symbol for name in model.names])
+        mine = np.array([symbol_of(name) == symbol for name in model.names])
         more = np.diag(np.where(mine, share * model.values, 0.0) ** 2)
         return replace(self, model=replace(model, covariance=model.covariance + more))
 
@@ -227,7 +227,7 @@ class Reference:
         here, there = np.array([b for _, b in pairs]), np.array([a for a, _ in pairs])
         covariance = own.covariance[np.ix_(there, there)] * wider**2
         values = own.values[there]
-        usual = np.array([_USUAL.get(_symbol(base.names[b]), _ELSE) for b in here])
+        usual = np.array([_USUAL.get(symbol_of(base.names[b]), _ELSE) for b in here])
         tolerance = np.zeros(len(here)) if self.habits else usual * np.abs(values)
         std = np.sqrt(np.diag(covariance))
         covariance = covariance + np.diag(tolerance**2 + (0.05 * std) ** 2)
@@ -258,12 +258,12 @@ def habit(
     values = np.array(days)
     count = np.isfinite(values).sum(axis=0)
     mean, own = np.nanmean(values, axis=0), np.nanmean([np.diag(c) for c in covariances], axis=0)
-    symbols = [_symbol(name) for name in names]
+    symbols = [symbol_of(name) for name in names]
     # With motor torques alone their rows show the offsets of the links' friction.
     sides = {"offm": "motor", "offl": "joint" if "joint" in torque_rms else "motor"}
     scale = np.array(
         [
-            float(torque_rms[sides[symbol]][_joint(name)]) if symbol in _OFFSETS else abs(value)
+            float(torque_rms[sides[symbol]][joint_of(name)]) if symbol in _OFFSETS else abs(value)
             for name, symbol, value in zip(names, symbols, mean, strict=True)
         ]
     )
@@ -283,8 +283,8 @@ def habit(
     return variance
 
 
-def _joint(name: str) -> int:
-    """Number from 0 of the joint of a drive's parameter."""
+def joint_of(name: str) -> int:
+    """Number from 0 of the joint of a drive's base parameter."""
     return int("".join(c for c in name if c.isdigit())) - 1
 
 
@@ -292,7 +292,7 @@ def _listed(values: Floats | None) -> list[float] | None:
     return None if values is None else [float(v) for v in values]
 
 
-def _symbol(name: str) -> str:
+def symbol_of(name: str) -> str:
     """Symbol of a base parameter: without joint and mark of regrouping."""
     return name.rstrip("R").rstrip("0123456789")
 
