@@ -374,5 +374,5 @@ def test_attempts_are_counted_and_their_logs_kept(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", ["{", "[]", '{"origin": "", "attempts": {}}'])
 def test_a_broken_progress_says_how_to_begin_anew(tmp_path: Path, content: str) -> None:
     (tmp_path / "progress.json").write_text(content)
-    with pytest.raises(DataError, match=r"progress\.json: cannot be read: .*; delete it"):
+    with pytest.raises(DataError, match=r"progress\.json: cannot be read, .*; delete it"):
         ExperimentProgress.load(tmp_path)

@@ -122,6 +122,9 @@ def flaws(seen: Seen) -> list[str]:
     found += [f"cut off: {html}" for html in page.evaluate(CUT)]
     axe = resources.files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8")
     for frame in page.frames:
+        # Nobody meets a hidden frame, such as that of the site's search.
+        if frame.parent_frame is not None and not frame.frame_element().is_visible():
+            continue
         frame.evaluate(axe)
         result = frame.evaluate(
             "axe.run(document, {resultTypes: ['violations'], preload: false, iframes: false})"
