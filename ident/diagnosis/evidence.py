@@ -271,7 +271,7 @@ class Evidence:
         gram, target = self._part_gram.sum(axis=0), self._part_target.sum(axis=0)
         self.full = self._fit(gram, target)
         self._free = None
-        if self.prior is not None and not self.compared:
+        if self.prior is not None and not self.compared and self.nominal.structure.chain.urdf is not None:
             self._free = self._fit(gram, target, with_prior=False)
         self._held = [
             self._fit(gram - g, target - t) for g, t in zip(self._part_gram, self._part_target, strict=True)
