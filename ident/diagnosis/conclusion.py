@@ -249,8 +249,7 @@ def _notes(bench: DiagnosisBench, reference: Reference | None) -> list[str]:
             "no motion repeats within a session: the residual of the model is the only measure of noise, so only "
             "causes of a large part of it are named"
         )
-    drawn = evidence.prior is not None and not evidence.compared
-    if drawn and nominal.structure.chain.urdf is not None:
+    if evidence.drawn:
         notes.append(
             "hardly excited parameters are held near the inertia of the URDF, within 20 %: a wrong URDF would show "
             "as a cause"

@@ -271,11 +271,16 @@ class Evidence:
         gram, target = self._part_gram.sum(axis=0), self._part_target.sum(axis=0)
         self.full = self._fit(gram, target)
         self._free = None
-        if self.prior is not None and not self.compared and self.nominal.structure.chain.urdf is not None:
+        if self.drawn:
             self._free = self._fit(gram, target, with_prior=False)
         self._held = [
             self._fit(gram - g, target - t) for g, t in zip(self._part_gram, self._part_target, strict=True)
         ]
+
+    @property
+    def drawn(self) -> bool:
+        """Whether the prior is the arm's drawing, and not a healthy arm or the bounds of its friction alone."""
+        return self.prior is not None and not self.compared and self.nominal.structure.chain.urdf is not None
 
     def _fit(self, gram: Floats, target: Floats, *, with_prior: bool = True) -> Fit:
         """Values from sums of products, `with_prior` if there is one."""
