@@ -155,6 +155,17 @@ def _cos_sin(angle, cosine, sine, size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def _rest(body, gravity, size):  # type: ignore[no-untyped-def]
+    """A base at rest, accelerated against gravity: rows 0-8 of the scratch."""
+    for s in range(size):
+        for i in range(6):
+            body[i, s] = 0.0
+        body[6, s] = -gravity[0]
+        body[7, s] = -gravity[1]
+        body[8, s] = -gravity[2]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def _fill(q, qd, qdd, ca, sa, d, theta, r, prismatic, gravity, columns, out):  # type: ignore[no-untyped-def]
     samples, n = q.shape
     block = min(_BLOCK, samples)
@@ -166,12 +177,7 @@ def _fill(q, qd, qdd, ca, sa, d, theta, r, prismatic, gravity, columns, out):  #
     joint = np.zeros((6, block))
     for start in range(0, samples, _BLOCK):
         size = min(_BLOCK, samples - start)
-        for s in range(size):
-            for i in range(6):
-                body[i, s] = 0.0
-            body[6, s] = -gravity[0]
-            body[7, s] = -gravity[1]
-            body[8, s] = -gravity[2]
+        _rest(body, gravity, size)
         for k in range(n):
             turning = 1.0 - prismatic[k]
             for s in range(size):
@@ -455,12 +461,7 @@ def _newton_euler(ct, st, rr, qd, qdd, ca, sa, d, prismatic, gravity, bodies, ou
     body, joint, force = np.zeros((9, block)), np.zeros((n, 5, block)), np.zeros((n, 6, block))
     for start in range(0, samples, _BLOCK):
         size = min(_BLOCK, samples - start)
-        for s in range(size):
-            for i in range(6):
-                body[i, s] = 0.0
-            body[6, s] = -gravity[0]
-            body[7, s] = -gravity[1]
-            body[8, s] = -gravity[2]
+        _rest(body, gravity, size)
         for k in range(n):
             for s in range(size):
                 joint[k, 0, s] = ct[start + s, k]
