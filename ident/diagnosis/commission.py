@@ -251,7 +251,7 @@ def commission(
     null: dict[tuple[str, int], float] = {}
     for number, recordings in enumerate(recorded):
         others = [day for k, day in enumerate(days) if k != number]
-        rest = _reference(others, known, robot, parts[0], {}) if others else None
+        rest = _reference(others, known, robot, parts[0], {}, days) if others else None
         bench = prepare_bench(known, recordings, settings, rest, None, fit_compliance=False)
         own = gains(bench.dictionary, bench.evidence, settings)
         for key, gain in (own | remainder_gains(bench.dictionary, bench.evidence)).items():
@@ -392,12 +392,15 @@ def _reference(
     robot: str,
     sessions: Sequence[Session],
     null: Mapping[tuple[str, int], float],
+    habits: Sequence[_Day] = (),
 ) -> Reference:
+    """The mean of days, with the changes from day to day of the `habits`, default of these days."""
     kinds = [sorted(day.masses.items()) for day in days]
     usual = days[max(range(len(days)), key=lambda k: kinds.count(kinds[k]))]
     base, known = usual.base, [_known(day, usual) for day in days]
     rms = {side: np.mean([day.torque_rms[side] for day in days], axis=0) for side in usual.torque_rms}
-    variance = habit(base.names, [values for values, _ in known], [c for _, c in known], rms)
+    changing = [_known(day, usual) for day in habits] or known
+    variance = habit(base.names, [values for values, _ in changing], [c for _, c in changing], rms)
     precision, pull = np.zeros((len(base), len(base))), np.zeros(len(base))
     for values, covariance in known:
         # A mean weighted by each day's own uncertainty alone would turn their changes into errors of all parameters.

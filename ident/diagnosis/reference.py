@@ -43,6 +43,9 @@ _ELSE = 0.01
 _OFFSETS = ("offl", "offm")
 # Weight of the usual change beside that of this arm, in changes of a parameter.
 _USUAL_CHANGES = 2.0
+# Weight of the scatter of a symbol beside that of a parameter, and of the expected scatter beside the symbol's, in
+# changes.
+_ALIKE = 4.0
 # Relative standard deviation of an announced mass.
 _WEIGHED = 0.02
 _ONE_IN = 0.01
@@ -253,7 +256,9 @@ def habit(
     torque_rms : of the rows by side, (n,) [Nm].
     Joints of an arm have the same habits, so all parameters of a symbol share one relative variance: the scatter of the
     days beyond their own uncertainty, and the usual change as some further changes. Two days of a 7-joint arm are
-    seven changes of its Coulomb friction.
+    seven changes of its Coulomb friction. What the model lacks bends the parameters differently with each motion, those
+    of small value too: where they scatter by more than that, their variance grows with their uncertainty, by a factor
+    shared by the symbol and refined for each parameter by its own days.
     """
     values = np.array(days)
     count = np.isfinite(values).sum(axis=0)
@@ -280,6 +285,11 @@ def habit(
         total = max(float(np.sum(scatter / scale[telling] ** 2)), 0.0)
         share = (_USUAL_CHANGES * usual[mine][0] ** 2 + total) / (_USUAL_CHANGES + changes)
         variance[mine] = share * scale[mine] ** 2
+        expected = own[mine] + variance[mine]
+        excess = np.nansum((values[:, mine] - mean[mine]) ** 2, axis=0) / np.maximum(expected, 1e-300)
+        common = max((_ALIKE + excess.sum()) / (_ALIKE + np.sum(count[mine] - 1)), 1.0)
+        each = (_ALIKE * common + excess) / (_ALIKE + count[mine] - 1)
+        variance[mine] += np.maximum(each - 1.0, 0.0) * own[mine]
     return variance
 
 

@@ -133,6 +133,21 @@ def test_habit_of_an_offset_is_measured_by_the_torque_of_its_rows() -> None:
     assert np.sqrt(alone) == pytest.approx([0.1])
 
 
+def test_parameters_bent_by_each_motion_scatter_with_their_uncertainty() -> None:
+    """First moments near zero: no share of their value tells how far an incomplete model moves them."""
+    names = tuple(f"MX{k}" for k in range(2, 8))
+    own = 1e-3
+    rng = np.random.default_rng(1)
+    steady, bent = (
+        [sigma * rng.normal(size=6) + np.array([0.0, 0.01, 0.0, -0.01, 0.02, 0.0]) for _ in range(3)]
+        for sigma in (own, 6.0 * own)
+    )
+    covariances = [np.eye(6) * own**2] * 3
+    assert np.all(np.sqrt(habit(names, steady, covariances, {})) < own)
+    found = np.sqrt(habit(names, bent, covariances, {}))
+    assert np.all((found > 2.0 * own) & (found < 12.0 * own))
+
+
 def test_slow_motor_samples_leave_a_drive_inertia_uncertain_by_their_phase(
     make: Make, chain: Chain, reference: Reference
 ) -> None:
