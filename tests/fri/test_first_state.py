@@ -99,7 +99,7 @@ def test_a_port_has_sixteen_bits(port: int, taken: bool) -> None:
     if taken:
         assert RemoteEnd("127.0.0.1", port, network=network).address[1] == (port or 49152)
     else:
-        with pytest.raises(ConfigurationError, match=f"port {port} is outside 0..65535"):
+        with pytest.raises(ConfigurationError, match=rf"port {port} is outside 0\.\.65535"):
             RemoteEnd("127.0.0.1", port, network=network)
 
 
@@ -110,7 +110,7 @@ def test_bits_for_krl_are_set_and_cleared_one_by_one() -> None:
     end.set_krl_bool(3, False)
     assert int(end.command["krl_bool"]) == 0x8001
     for index in (-1, 16):
-        with pytest.raises(ValueError, match="outside 0..15"):
+        with pytest.raises(ValueError, match=r"outside 0\.\.15"):
             end.set_krl_bool(index, True)
 
 
