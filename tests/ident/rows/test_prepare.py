@@ -273,6 +273,8 @@ def test_rows_pass_half_the_band_of_an_earlier_filter_where_their_rate_carries_i
     found = bench(band)._smooth(values, rows)
     expected = low_pass(values, 0.02, 0.5 * band) if smoothed and band else values
     np.testing.assert_allclose(found, expected, atol=1e-12)
+    single = type("Rows", (), {"time": np.zeros(1)})()
+    np.testing.assert_array_equal(bench(band)._smooth(values[:1], single), values[:1])
 
 
 def test_an_earlier_filter_over_the_widest_window_leaves_the_reversals_in() -> None:
