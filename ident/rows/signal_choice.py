@@ -130,7 +130,7 @@ def _with_decimation(
         passed_band(channel.effort, channel.period_s)
         for session in sessions
         for channel in (session.joint, session.motor if motor else None)
-        if channel is not None and channel.effort.shape[1]
+        if channel is not None
     ]
     band = min((edge for edge in edges if edge is not None), default=None)
     if settings.decimate_hz is not None:

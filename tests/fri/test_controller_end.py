@@ -157,6 +157,18 @@ def test_a_real_time_cycle_rates_the_answer_by_its_delay(link: Link, clock: Cloc
     assert record["latency"] == pytest.approx(0.0005)
 
 
+def test_an_answer_at_the_deadline_ends_a_real_time_cycle(link: Link, clock: Clock) -> None:
+    link.session.fri_open(2)
+    clock.at(0.002, link.reply)
+    clock.at(0.002, lambda: link.say(b"next"))
+    setpoint = link.end.real_time(link.session, link.rig.sample, clock.start + 0.002)
+    assert setpoint.state is State.MON
+    assert link.session.counters()["answered"] == 1
+    # What comes later is for the next cycle.
+    clock.select((), (), (), 0.0)
+    assert link.end.receive(0.0) == b"next"
+
+
 def test_a_closed_session_in_real_time_drops_what_comes(link: Link, clock: Clock) -> None:
     link.say(b"x" * 376)
     assert link.end.real_time(link.session, link.rig.sample, clock.start + 0.002).state is State.OFF

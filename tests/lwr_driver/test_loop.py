@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ import pytest
 
 from fri.states import ALL_DRIVES, Control, EventKind, Quality, State
 from lwr_driver.control import BIN_NS, Job, Mode, Result, Text, Word
+from lwr_driver.loop import Loop
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.ring import NO_PHASE, ROW, Ring
 from tests.lwr_driver.driver_rig import START, Rig, arm
@@ -749,3 +751,14 @@ def test_packets_that_stay_ahead_of_their_time_end_the_motion(rig):
     pace.feed = lambda counted, *_, **__: counted
     assert r.until_done() is Result.NETWORK
     assert "run ahead of time" in r.reason
+
+
+def test_the_loop_turns_the_torques_to_the_direction_of_their_joints(rig) -> None:
+    one = rig()
+    one.loop.remote.close()
+    sign = (1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0)
+    one.settings = dataclasses.replace(one.settings, port=one.loop.remote.address[1], torque_sign=sign)
+    one.loop = Loop(one.settings, one.arm.limits, one.control, network=one.network)
+    one.sample.msr_jnt_trq[:] = np.arange(1.0, 8.0)
+    one.cycles(30)
+    assert one.loop.remote.msr["msr_jnt_trq"].tolist() == [1.0, -2.0, 3.0, 4.0, 5.0, 6.0, -7.0]
