@@ -762,3 +762,18 @@ def test_the_loop_turns_the_torques_to_the_direction_of_their_joints(rig) -> Non
     one.sample.msr_jnt_trq[:] = np.arange(1.0, 8.0)
     one.cycles(30)
     assert one.loop.remote.msr["msr_jnt_trq"].tolist() == [1.0, -2.0, 3.0, 4.0, 5.0, 6.0, -7.0]
+
+
+def test_the_next_packet_is_looked_out_for_before_it_is_due(rig) -> None:
+    one = rig(2)
+    one.cycles(30)
+    asked: list[tuple[int, int, int]] = []
+    never = SimpleNamespace(
+        next=lambda more: False, wait=lambda *window: asked.append(window) or False, arrived=False
+    )
+    one.loop._make_ready = lambda turnaround: None
+    assert not one.loop._look_out(never, 0.25)
+    ((early, late, timeout),) = asked
+    # The packet before came at a time past, so the next is due within a period.
+    assert early < late < round(1e9 * (0.002 + 0.002))
+    assert timeout == 250_000_000
