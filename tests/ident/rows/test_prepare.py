@@ -196,6 +196,15 @@ def test_the_mean_torque_counts_each_sample_between_the_rows_once() -> None:
     assert _mean_torque([passage(times, torque, np.array([20.0, 21.0]), (-np.inf, np.inf))]) == (0.0,)
 
 
+def test_a_sample_on_the_edge_of_two_blocks_belongs_to_the_later_one() -> None:
+    times = np.array([3.0, 4.0, 5.0])
+    first, second = (
+        passage(times, np.zeros(3), np.array([3.0, 5.0]), core) for core in ((-np.inf, 4.0), (4.0, np.inf))
+    )
+    assert first.own(times).tolist() == [True, False, False]
+    assert second.own(times).tolist() == [False, True, True]
+
+
 def test_blocks_cover_a_stretch_once_and_overlap_by_the_reach_of_their_filters() -> None:
     time = 0.01 * np.arange(60_001)
     ((part,), _) = stretches(time, time[:, None], np.zeros(len(time), dtype=bool), 0.01, 0.02)
