@@ -33,6 +33,8 @@ class Clock:
         return self.now
 
     def select(self, *arguments: object) -> None:
+        assert arguments[0]
+        assert not any(arguments[1:3])
         timeout = float(arguments[3])  # type: ignore[arg-type]
         self.waits.append(timeout)
         assert len(self.waits) < 1000
@@ -165,7 +167,7 @@ def test_an_answer_at_the_deadline_ends_a_real_time_cycle(link: Link, clock: Clo
     assert setpoint.state is State.MON
     assert link.session.counters()["answered"] == 1
     # What comes later is for the next cycle.
-    clock.select((), (), (), 0.0)
+    clock.select((link.end,), (), (), 0.0)
     assert link.end.receive(0.0) == b"next"
 
 

@@ -283,3 +283,37 @@ def test_copies_and_elements_share_nothing() -> None:
     copy[1]["X"], copy[2]["X"] = 7.0, 8.0
     assert (table[1]["X"], table[2]["X"], copy[3]["X"]) == (5.0, 1.0, 1.0)
     assert (duplicate(table).size, duplicate(Table(0, 4)).size) == (0, 4)
+
+
+@pytest.mark.parametrize("index", ["NOVEL", "1+NOVEL", "ABS(NOVEL)"])
+@pytest.mark.parametrize("statement", ["$FRI_TO_INT[{}]=1", "X=$FRI_TO_INT[{}]", "LOAD_DATA[{}].M=1.0"])
+def test_an_unknown_name_within_an_index_is_found_before_the_program_runs(index: str, statement: str) -> None:
+    with pytest.raises(ConfigurationError, match="line 3: there is no variable NOVEL"):
+        KrlProgram(f"DEF p( )\nDECL INT X\n{statement.format(index)}\nEND\n")
+
+
+@pytest.mark.parametrize(("passes", "ends"), [(2000, True), (2002, False)])
+@pytest.mark.parametrize(("head", "foot"), [("WHILE N<{}", "ENDWHILE"), ("REPEAT", "UNTIL N>={}")])
+def test_a_loop_passes_two_thousand_times_without_a_wait(
+    passes: int, ends: bool, head: str, foot: str
+) -> None:
+    body = f"DECL INT N\nN=0\n{head.format(passes)}\nN=N+1\n{foot.format(passes)}\n$FRI_TO_INT[1]=N"
+    rig, program = Rig().open(), KrlProgram(f"DEF p( )\n{body}\nEND\n")
+    if ends:
+        program.step(rig.session)
+        assert int(rig.session.to_int[0]) == passes
+    else:
+        with pytest.raises(RobotError, match="line 4: the loop never waits"):
+            program.step(rig.session)
+
+
+@pytest.mark.parametrize(("deep", "ends"), [(99, True), (101, False)])
+def test_a_subprogram_calls_itself_a_hundred_times_at_most(deep: int, ends: bool) -> None:
+    text = f"DEF p( )\nDOWN({deep})\n$FRI_TO_INT[1]=1\nEND\nDEF DOWN(N:IN)\nINT N\nIF N>1 THEN\nDOWN(N-1)\nENDIF\nEND\n"
+    rig, program = Rig().open(), KrlProgram(text)
+    if ends:
+        program.step(rig.session)
+        assert program.finished
+    else:
+        with pytest.raises(RobotError, match="DOWN calls itself without end"):
+            program.step(rig.session)

@@ -777,3 +777,12 @@ def test_the_next_packet_is_looked_out_for_before_it_is_due(rig) -> None:
     # The packet before came at a time past, so the next is due within a period.
     assert early < late < round(1e9 * (0.002 + 0.002))
     assert timeout == 250_000_000
+
+
+def test_without_a_request_the_answer_made_ready_begins_no_motion(rig) -> None:
+    one = rig()
+    one.enter()
+    asked: list[tuple[int, int]] = []
+    one.loop._commander.foresee = lambda sequence, rows, most: asked.append((rows, most))
+    one.loop._make_ready(SimpleNamespace(disarm=lambda: one.control.words, most=4))
+    assert asked == [(0, 1)]
