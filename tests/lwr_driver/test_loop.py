@@ -776,6 +776,8 @@ def test_the_next_packet_is_looked_out_for_before_it_is_due(rig) -> None:
     ((early, late, timeout),) = asked
     # The packet before came at a time past, so the next is due within a period.
     assert early < late < round(1e9 * (0.002 + 0.002))
+    # From 40 % of the period before, to 0.15 ms after the packet is due.
+    assert late - early == pytest.approx(800_000 + 150_000, abs=2)
     assert timeout == 250_000_000
 
 

@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from scipy.signal import firwin, kaiser_beta
+from scipy.signal import butter, firwin, kaiser_beta, sosfiltfilt
 
 from fri.errors import ConfigurationError
 from ident.rows.filters import (
@@ -17,6 +17,7 @@ from ident.rows.filters import (
     differentiate,
     half_width,
     interpolate_uniform,
+    low_pass,
     moving,
     thinning,
 )
@@ -214,3 +215,10 @@ def test_advice_names_the_channel_and_its_figure(facts: dict[str, float], named:
     usual = {"excitation_hz": 0.5, "joint_rate_hz": 1000.0, "motor_rate_hz": 250.0}
     assert advice(SignalSettings(), **usual) == ()  # type: ignore[arg-type]
     assert any(named in sentence for sentence in advice(SignalSettings(), **{**usual, **facts}))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("count", "pad"), [(5, 4), (30, 29), (31, 30), (400, 30)])
+def test_a_low_pass_is_extended_by_three_periods_of_its_cut_off_or_all_there_is(count: int, pad: int) -> None:
+    values = np.random.default_rng(count).normal(size=(count, 2)).cumsum(axis=0)
+    expected = sosfiltfilt(butter(4, 0.2, output="sos"), values, axis=0, padlen=pad)
+    np.testing.assert_allclose(low_pass(values, 0.01, 10.0), expected, atol=1e-9)

@@ -203,6 +203,9 @@ def test_a_sample_on_the_edge_of_two_blocks_belongs_to_the_later_one() -> None:
     )
     assert first.own(times).tolist() == [True, False, False]
     assert second.own(times).tolist() == [False, True, True]
+    whole = Passage(first.rows, first.index, first.joint, first.joint_valid, None, None)
+    assert whole.own(times).all()
+    assert not whole.continues
 
 
 def test_blocks_cover_a_stretch_once_and_overlap_by_the_reach_of_their_filters() -> None:
