@@ -10,7 +10,7 @@ import pytest
 from fri.errors import ConfigurationError
 from ident.dynamics import regressor
 from ident.dynamics.base_set import numeric_base
-from ident.dynamics.kinematics import Chain
+from ident.dynamics.kinematics import Chain, _perpendicular
 from ident.dynamics.physical import project
 from ident.dynamics.structure import Coulomb, ModelStructure
 from ident.dynamics.urdf import read_urdf
@@ -74,6 +74,15 @@ def test_a_table_has_no_bodies_and_a_position_for_each_joint() -> None:
         chain().forward(np.zeros(3))
 
 
+def test_a_link_frame_has_an_axis_across_that_of_its_joint() -> None:
+    up = np.array([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(_perpendicular(np.eye(4), up), [1.0, 0.0, 0.0])
+    # Its x axis along the joint: y is taken.
+    np.testing.assert_allclose(_perpendicular(np.roll(np.eye(4), 2, axis=1), up)[2], 0.0, atol=1e-12)
+    with pytest.raises(ConfigurationError, match="is not a rotation"):
+        _perpendicular(np.zeros((4, 4)), up)
+
+
 def test_a_column_map_has_ten_columns_a_link() -> None:
     q, qd, qdd = states(chain(), 3)
     with pytest.raises(ConfigurationError, match=r"column map has shape \(2, 9\); expected \(2, 10\)"):
@@ -86,6 +95,11 @@ def test_one_state_has_the_regressor_of_many() -> None:
     one = regressor.rigid_regressor(chain(), q, qd, qdd)
     assert one.shape == (2, 1, 20)
     np.testing.assert_allclose(one[:, 0], many[:, 1], atol=1e-12)
+    # Of the first link the mass alone, behind all parameters of the second.
+    some = np.full((2, 10), -1, dtype=np.int64)
+    some[1], some[0, 9] = np.arange(10), 10
+    few = regressor.rigid_regressor(chain(), q, qd, qdd, columns=some)
+    np.testing.assert_allclose(few[:, 0], many[:, 1][:, [*range(10, 20), 9]], atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from ident.estimators import (
     RowGroup,
     WeightedLeastSquares,
 )
+from ident.estimators.covariance import jackknife
 from ident.estimators.names import SUMMARIES
 from ident.estimators.physical import _compact, _sizes, _svec, _touching, cad_prior
 from ident.estimators.prior import Disagreement
@@ -204,6 +205,28 @@ def test_without_deviations_of_its_own_a_recursion_takes_those_of_weighted_least
     assert found.notes == ()
     for one, other in zip(found.classes, plain.classes, strict=True):
         assert one.parameters == pytest.approx(other.parameters, rel=1e-5)
+
+
+def test_the_jackknife_of_a_recursion_leaves_out_blocks_of_its_forgotten_rows() -> None:
+    case = noisy(samples=30)
+    sigma = np.array([0.05, 0.3, 1.0])
+    by_label = dict(zip((c.label for c in case.classes), sigma, strict=True))
+    settings = CovarianceSettings("jackknife", block_s=1.0)
+    found = RecursiveLeastSquares(4.0, Prior(CHI, np.eye(12)), sigma=by_label, covariance=settings).fit(case)
+    age = [59 - 30 * group.record - group.time_index for group in case.groups]
+    weights = [
+        np.exp(-0.05 * a) / sigma[number] ** 2 for a, number in zip(age, case.class_of_group, strict=True)
+    ]
+    expected = jackknife(
+        case,
+        found.covariances["textbook"].matrix,
+        [w * e for w, e in zip(weights, case.residuals(found.values), strict=True)],
+        weights,
+        1.0,
+        correlation=found.covariances["hac"].matrix,
+        consumed=np.array([fit.parameters for fit in found.classes]),
+    )
+    np.testing.assert_allclose(found.covariance.matrix, expected.matrix, rtol=1e-6)
 
 
 def test_a_long_memory_forgets_by_its_time_constant() -> None:

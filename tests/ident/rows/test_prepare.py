@@ -193,6 +193,8 @@ def test_the_mean_torque_counts_each_sample_between_the_rows_once() -> None:
     ]
     assert _mean_torque(halves) == (pytest.approx(36.0 / 8.0),)
     assert [one.continues for one in halves] == [False, True]
+    both = replace(halves[0].joint, torque=np.column_stack([torque, 2.0 * torque]))
+    assert _mean_torque([replace(halves[0], joint=both)]) == (pytest.approx(10.0 / 4.0), pytest.approx(5.0))
     assert _mean_torque([passage(times, torque, np.array([20.0, 21.0]), (-np.inf, np.inf))]) == (0.0,)
 
 
@@ -226,6 +228,13 @@ def test_blocks_cover_a_stretch_once_and_overlap_by_the_reach_of_their_filters()
         if k < 3:
             assert 1.0 < 0.01 * high - end < 20.0
     assert len(list(_cut(part, settings, True))[1:3]) == 2
+    # At 1 kHz twelve neighbours are averaged: blocks and their overlaps are whole numbers of twelve.
+    fast = list(_cut(replace(part, dt=0.001, count=600_001), SignalSettings().settled(1000.0), True))
+    assert len(fast) == 4
+    for (low, high), (begin, _) in fast[1:]:
+        first = round((begin + 0.0005) / 0.001)
+        assert ((first - 200) % 12, (first - low) % 12) == (0, 0)
+        assert high == 600_001 or (high - 200) % 12 == (first - low) % 12
     short = replace(part, count=24_039)
     assert len(list(_cut(short, settings, True))) == 1
     assert len(list(_cut(replace(part, count=24_041), settings, True))) == 2
