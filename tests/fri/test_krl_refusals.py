@@ -11,7 +11,7 @@ from fri.krc import EventKind, KrcPolicy, KrcSession
 from fri.krl import KrlProgram
 from fri.krl_source import parse_source
 from fri.krl_tree import Constant, Ignored, Name, Unary
-from fri.states import Control, State
+from fri.states import ALL_DRIVES, Control, State
 from tests.fri.fri_rig import LIMITS, Q_START, QUICK, Rig
 
 
@@ -153,3 +153,19 @@ def test_a_port_in_a_process_has_no_descriptor_and_waits_for_nothing() -> None:
     assert port.recv_into(buffer) == 4
     assert buffer == b"abcd"
     assert port.sendto(b"abc", port.getsockname()) == 3
+
+
+def test_drives_that_stay_on_or_off_do_not_end_command_mode() -> None:
+    rig = Rig().command_mode()
+    rig.session.set_drives(ALL_DRIVES)
+    rig.session.set_drives(0x3F)
+    assert rig.session.state is State.CMD
+    rig.session.set_drives(0)
+    assert rig.session.state is State.MON
+    without = Rig().open()
+    without.session.set_drives(0)
+    without.cycles(20)
+    without.session.fri_start()
+    without.cycle()
+    without.session.set_drives(0)
+    assert without.session.state is State.CMD
