@@ -37,6 +37,17 @@ from tests.fri.fri_rig import LIMITS, Q_START, QUICK, Rig
         ("DEF p( )\nEXT\nEND", "line 2: .* names no subprogram"),
         ("DEF p( ) 5\nEND", "line 1: '5' is too much"),
         ("p( )\nEND", "line 1: found 'P' where 'DEF' is expected"),
+        ("DEF p( )\nLOOP 5\nENDLOOP\nEND", "line 2: '5' is too much"),
+        ("DEF p( )\nWHILE 1==1 5\nENDWHILE\nEND", "line 2: '5' is too much"),
+        ("DEF p( )\nIF 1==1 THEN 5\nENDIF\nEND", "line 2: '5' is too much"),
+        ("DEF p( )\nREPEAT 5\nUNTIL 1==1\nEND", "line 2: '5' is too much"),
+        ("DEF p( )\nREPEAT\nUNTIL 1==1 5\nEND", "line 3: '5' is too much"),
+        ("DEF p( )\nFOR K=1 TO 2 5\nENDFOR\nEND", "line 2: '5' is too much"),
+        ("DEF p( )\nHALT 5\nEND", "line 2: '5' is too much"),
+        ("DEF p( )\nEXIT 5\nEND", "line 2: '5' is too much"),
+        ("DEF p( )\nPTP XP1 5\nEND", "line 2: '5' is too much"),
+        ("DEF p( )\nFRISTOP() 5\nEND", "line 2: '5' is too much"),
+        ("DEF p( )\nSWITCH 1\nCASE 1 5\nENDSWITCH\nEND", "line 3: '5' is too much"),
     ],
 )
 def test_a_text_that_is_no_program_is_refused_with_its_line(text: str, message: str) -> None:

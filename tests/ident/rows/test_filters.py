@@ -18,6 +18,7 @@ from ident.rows.filters import (
     half_width,
     interpolate_uniform,
     low_pass,
+    median_step,
     moving,
     thinning,
 )
@@ -222,3 +223,9 @@ def test_a_low_pass_is_extended_by_three_periods_of_its_cut_off_or_all_there_is(
     values = np.random.default_rng(count).normal(size=(count, 2)).cumsum(axis=0)
     expected = sosfiltfilt(butter(4, 0.2, output="sos"), values, axis=0, padlen=pad)
     np.testing.assert_allclose(low_pass(values, 0.01, 10.0), expected, atol=1e-9)
+
+
+def test_two_samples_have_a_step_and_one_has_none() -> None:
+    assert median_step(np.array([1.0, 1.25])) == 0.25
+    assert median_step(np.array([0.0, 0.1, 0.3, 0.6])) == pytest.approx(0.2)
+    assert np.isnan(median_step(np.array([1.0])))
