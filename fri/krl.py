@@ -62,7 +62,9 @@ _OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
     "*": operator.mul,
 }
 
-# Yields times of the interpreter's clock [ms]; the result is EXIT or RETURN if one of them ended the block.
+# Both yield times of the interpreter's clock [ms]; the result of `Flow` is EXIT or RETURN if one of them ended the
+# block, else empty.
+Wait = Generator[float, None, None]
 Flow = Generator[float, None, str]
 
 
@@ -145,7 +147,7 @@ class KrlProgram:
         # Statements that never wait, and places of variables without indices, by their identity.
         self._plain: dict[int, bool] = {}
         self._places: dict[int, tuple[str, Path]] = {}
-        self._flow: Flow | None = None
+        self._flow: Wait | None = None
         self._motion: _Motion | None = None
         self._frames = [_Frame(0, {})]
         self._globals: list[dict[str, Any]] = []
@@ -209,7 +211,7 @@ class KrlProgram:
             return math.ceil(round((self._clock + after_ms) / TICK_MS, 9)) * TICK_MS
         return (math.floor(round(self._clock / TICK_MS, 9)) + 1) * TICK_MS
 
-    def _spend(self) -> Generator[float, None, None]:
+    def _spend(self) -> Wait:
         """The time of a statement, and of functions before it."""
         cost, self._owed = self._statement_ms + self._owed, 0.0
         if cost > 0.0 and not self._nested:
@@ -217,14 +219,14 @@ class KrlProgram:
         elif self._nested:
             self._owed += cost
 
-    def _pause(self, until_ms: float) -> Generator[float, None, None]:
+    def _pause(self, until_ms: float) -> Wait:
         if self._nested:
             raise RobotError(
                 "a function that waits is called within an expression; assign its result to a variable"
             )
         yield until_ms
 
-    def _enter(self, title: str, arguments: list[Any]) -> Flow:
+    def _enter(self, title: str, arguments: list[Any]) -> Wait:
         """Run the subprogram `title` with the values of its arguments; its frame holds the result."""
         frame = self._frame(title, arguments)
         try:
@@ -232,7 +234,6 @@ class KrlProgram:
         finally:
             self._frames.pop()
             self._last = frame
-        return ""
 
     def _frame(self, title: str, arguments: list[Any]) -> _Frame:
         """The frame of a subprogram that begins with the values of its arguments."""
@@ -245,11 +246,10 @@ class KrlProgram:
         self._frames.append(frame)
         return frame
 
-    def _call(self, call: tree.Call) -> Flow:
+    def _call(self, call: tree.Call) -> Wait:
         """Run a subprogram of the program; changed arguments by reference go back to the caller."""
         yield from self._enter(call.name, [self._value(argument) for argument in call.arguments])
         self._give_back(call)
-        return ""
 
     def _give_back(self, call: tree.Call) -> None:
         _, subprogram = self._programs[call.name]
@@ -418,7 +418,7 @@ class KrlProgram:
                 self._line = statement.line
                 raise RobotError("the loop never waits")
 
-    def _move(self, statement: tree.Move) -> Generator[float, None, None]:
+    def _move(self, statement: tree.Move) -> Wait:
         """Move KRL's setpoint to the goal; to the place of the arm, once the arm stands."""
         session = self._need()
         while session.ramping:

@@ -107,7 +107,7 @@ class SequenceTracker:
         elapsed = timestamp - self._timestamp
         cycles = elapsed / sample_time
         # The counter fixes the step up to multiples of its wrap; the clock picks the multiple.
-        step = delta if elapsed == 0.0 else delta + _WRAP * round((cycles - delta) / _WRAP)
+        step = delta + _WRAP * round((cycles - delta) / _WRAP)
         agrees = elapsed == 0.0 or abs(step - cycles) <= self._slack(cycles, timestamp, sample_time)
         if agrees and 0 < step < _WRAP // 2:
             return self._advance(step, send_seq, timestamp)

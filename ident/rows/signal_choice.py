@@ -130,7 +130,7 @@ def _with_decimation(
         passed_band(channel.effort, channel.period_s)
         for session in sessions
         for channel in (session.joint, session.motor if motor else None)
-        if channel is not None and channel.effort.shape[1]
+        if channel is not None
     ]
     band = min((edge for edge in edges if edge is not None), default=None)
     if settings.decimate_hz is not None:
@@ -230,8 +230,10 @@ class _Bench:
 
     def _smooth(self, values: Floats, rows: BinnedRows) -> Floats:
         """Rows (m, k) with a low-pass common to torque and columns where an earlier one smoothed the torques."""
-        dt = float(np.median(np.diff(rows.time))) if len(rows.time) > 1 else 0.0
-        if self.band is None or 0.5 * self.band * dt >= 0.4:
+        if self.band is None or len(rows.time) < 2:
+            return values
+        dt = float(np.median(np.diff(rows.time)))
+        if 0.5 * self.band * dt >= 0.4:
             return values
         return low_pass(values, dt, 0.5 * self.band)
 

@@ -33,6 +33,8 @@ class Clock:
         return self.now
 
     def select(self, *arguments: object) -> None:
+        assert arguments[0]
+        assert not any(arguments[1:3])
         timeout = float(arguments[3])  # type: ignore[arg-type]
         self.waits.append(timeout)
         assert len(self.waits) < 1000
@@ -155,6 +157,18 @@ def test_a_real_time_cycle_rates_the_answer_by_its_delay(link: Link, clock: Cloc
     assert link.session.miss_counter == 0
     record = np.frombuffer(link.session.packet(link.rig.sample), MSR)[0]
     assert record["latency"] == pytest.approx(0.0005)
+
+
+def test_an_answer_at_the_deadline_ends_a_real_time_cycle(link: Link, clock: Clock) -> None:
+    link.session.fri_open(2)
+    clock.at(0.002, link.reply)
+    clock.at(0.002, lambda: link.say(b"next"))
+    setpoint = link.end.real_time(link.session, link.rig.sample, clock.start + 0.002)
+    assert setpoint.state is State.MON
+    assert link.session.counters()["answered"] == 1
+    # What comes later is for the next cycle.
+    clock.select((link.end,), (), (), 0.0)
+    assert link.end.receive(0.0) == b"next"
 
 
 def test_a_closed_session_in_real_time_drops_what_comes(link: Link, clock: Clock) -> None:

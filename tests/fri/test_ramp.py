@@ -68,3 +68,31 @@ def test_missing_commands_are_bridged_at_the_pace_of_the_last_ones():
         assert span == 2.0
         track.command(begin + 4 * step)
         np.testing.assert_allclose(track.extrapolated(), begin + 5 * step, atol=1e-12)
+
+
+def test_a_step_is_counted_over_the_cycles_since_the_command_before():
+    track = SetpointTrack(LIMITS, KrcPolicy(), Q_START)
+    step = np.full(7, 1e-3)
+    # From rest, over one cycle.
+    change, cycles = track.change_of_step(Q_START + step)
+    np.testing.assert_allclose(change, step)
+    assert cycles == 1.0
+    track.command(Q_START + step)
+    np.testing.assert_allclose(track.extrapolated(), Q_START + 2.0 * step)
+    change, cycles = track.change_of_step(Q_START + 2.5 * step)
+    np.testing.assert_allclose(change, 0.5 * step)
+    assert cycles == 1.0
+    track.bridge()
+    track.bridge()
+    assert track.missed == 2
+    # Three cycles after the last command, in the mean two from the middle of one step to that of the other.
+    change, cycles = track.change_of_step(Q_START + 7.0 * step)
+    np.testing.assert_allclose(change, step)
+    assert cycles == 2.0
+    track.command(Q_START + 7.0 * step)
+    assert track.missed == 0
+    np.testing.assert_allclose(track.extrapolated(), Q_START + 9.0 * step)
+    assert track.change_of_step(Q_START + 9.0 * step)[1] == 2.0
+    track.rest()
+    np.testing.assert_allclose(track.extrapolated(), Q_START + 7.0 * step)
+    assert track.change_of_step(Q_START)[1] == 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ import pytest
 
 from fri.states import ALL_DRIVES, Control, EventKind, Quality, State
 from lwr_driver.control import BIN_NS, Job, Mode, Result, Text, Word
+from lwr_driver.loop import Loop
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.ring import NO_PHASE, ROW, Ring
 from tests.lwr_driver.driver_rig import START, Rig, arm
@@ -749,3 +751,40 @@ def test_packets_that_stay_ahead_of_their_time_end_the_motion(rig):
     pace.feed = lambda counted, *_, **__: counted
     assert r.until_done() is Result.NETWORK
     assert "run ahead of time" in r.reason
+
+
+def test_the_loop_turns_the_torques_to_the_direction_of_their_joints(rig) -> None:
+    one = rig()
+    one.loop.remote.close()
+    sign = (1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0)
+    one.settings = dataclasses.replace(one.settings, port=one.loop.remote.address[1], torque_sign=sign)
+    one.loop = Loop(one.settings, one.arm.limits, one.control, network=one.network)
+    one.sample.msr_jnt_trq[:] = np.arange(1.0, 8.0)
+    one.cycles(30)
+    assert one.loop.remote.msr["msr_jnt_trq"].tolist() == [1.0, -2.0, 3.0, 4.0, 5.0, 6.0, -7.0]
+
+
+def test_the_next_packet_is_looked_out_for_before_it_is_due(rig) -> None:
+    one = rig(2)
+    one.cycles(30)
+    asked: list[tuple[int, int, int]] = []
+    never = SimpleNamespace(
+        next=lambda more: False, wait=lambda *window: asked.append(window) or False, arrived=False
+    )
+    one.loop._make_ready = lambda turnaround: None
+    assert not one.loop._look_out(never, 0.25)
+    ((early, late, timeout),) = asked
+    # The packet before came at a time past, so the next is due within a period.
+    assert early < late < round(1e9 * (0.002 + 0.002))
+    # From 40 % of the period before, to 0.15 ms after the packet is due.
+    assert late - early == pytest.approx(800_000 + 150_000, abs=2)
+    assert timeout == 250_000_000
+
+
+def test_without_a_request_the_answer_made_ready_begins_no_motion(rig) -> None:
+    one = rig()
+    one.enter()
+    asked: list[tuple[int, int]] = []
+    one.loop._commander.foresee = lambda sequence, rows, most: asked.append((rows, most))
+    one.loop._make_ready(SimpleNamespace(disarm=lambda: one.control.words, most=4))
+    assert asked == [(0, 1)]

@@ -6,7 +6,7 @@ import pytest
 
 from fri.errors import ConfigurationError
 from ident.dynamics import regressor
-from ident.dynamics.kinematics import Chain
+from ident.dynamics.kinematics import Chain, _snap
 from tests.ident.dynamics.core_arms import RIGHT, bodies, lwr, shared, states
 
 INERTIAL = (
@@ -274,3 +274,21 @@ def test_a_dictionary_that_is_no_chain_is_refused(change, message):
         del content["gravity"]
     with pytest.raises(ConfigurationError, match=message):
         Chain.from_dict(content)
+
+
+@pytest.mark.parametrize(
+    ("angle", "snapped"),
+    [
+        (0.0009, 0.0),
+        (0.0011, 0.0011),
+        (-RIGHT + 0.0009, -RIGHT),
+        (RIGHT - 0.0011, RIGHT - 0.0011),
+        (np.pi - 0.0005, np.pi),
+        (-np.pi + 0.0005, np.pi),
+        (-np.pi + 0.0011, -np.pi + 0.0011),
+    ],
+)
+def test_an_angle_near_a_quarter_turn_is_one_and_half_a_turn_is_positive(
+    angle: float, snapped: float
+) -> None:
+    assert _snap(angle, 0.001) == snapped

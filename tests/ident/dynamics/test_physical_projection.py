@@ -5,7 +5,7 @@ import pytest
 
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
-from ident.dynamics.physical import project, reference_bodies
+from ident.dynamics.physical import _root_weight, project, reference_bodies
 
 
 def bodies(count: int, seed: int = 0) -> np.ndarray:
@@ -89,3 +89,15 @@ def test_repaired_bodies_have_the_smallest_mass_and_radius_asked_for() -> None:
     np.testing.assert_allclose(com, [0.1, 0.0, 0.3], atol=1e-12)
     # The origin's second moment was given as zero: the repair is about the centre of mass.
     np.testing.assert_allclose(inertia, 2.0 * 0.03**2 * np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_a_direction_without_variance_is_held_to_a_millionth_of_the_scale(size: float) -> None:
+    scale = np.array([2.0, 5.0, 0.0])
+    root = _root_weight(scale, np.diag([size * 4.0, 0.0, size]))
+    floor = max(1e-12, 1e-12 * size)
+    np.testing.assert_allclose(
+        root.T @ root, np.diag([1.0 / (4.0 * size), 1.0 / (25.0 * floor), 1.0 / size]), rtol=1e-9, atol=1e-12
+    )
+    plain = _root_weight(scale, None)
+    np.testing.assert_allclose(plain, np.diag([0.5, 0.2, 1.0]))

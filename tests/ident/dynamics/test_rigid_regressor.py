@@ -178,3 +178,24 @@ def test_a_plain_single_sample_is_a_batch_of_one():
         regressor.torque(chain, *now, inertial)
     with pytest.raises(DataError, match="`qd` of joint E1 is inf at sample 0"):
         regressor.rigid_regressor(chain, *now)
+
+
+@pytest.mark.parametrize("arm", [lwr, scara])
+def test_frames_with_one_joint_elsewhere_are_those_of_the_changed_positions(arm):
+    chain = arm()
+    q, qd, qdd = states(chain, 20)
+    at = regressor.frames(chain, q)
+    before = [part.copy() for part in at]
+    for joint in range(chain.n):
+        moved = q.copy()
+        moved[:, joint] += 0.3
+        found = regressor.moved_frames(chain, at, moved[:, joint], joint)
+        for one, other in zip(found, regressor.frames(chain, moved), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-13)
+        np.testing.assert_allclose(
+            regressor.torque_in(chain, found, qd, qdd, bodies(chain.n)),
+            regressor.torque(chain, moved, qd, qdd, bodies(chain.n)),
+            atol=1e-10,
+        )
+    for one, other in zip(at, before, strict=True):
+        np.testing.assert_array_equal(one, other)
