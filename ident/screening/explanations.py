@@ -93,13 +93,15 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
     for candidate in _torques(data, data.gains(fit, normal)):
         after = candidate.mended.fit(normal, doubtful=False)
         tried.append(replace(candidate, drop=before - after.score))
-        if believed(tried[-1], len(normal)) and max(after.rho.values()) < AGREES:
+        if believed(tried[-1], len(normal.classes)) and max(after.rho.values()) < AGREES:
             break
     else:
         for candidate in _motions(data):
             drop = before - candidate.mended.fit(doubtful=False).score
             tried.append(replace(candidate, drop=drop))
-    best = max((one for one in tried if believed(one, len(normal))), key=lambda one: one.drop, default=None)
+    best = max(
+        (one for one in tried if believed(one, len(normal.classes))), key=lambda one: one.drop, default=None
+    )
     return None if best is None else _refined(best, before)
 
 

@@ -19,8 +19,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_solve
-from scipy.linalg.lapack import dpstrf
+from scipy.linalg.lapack import dpotrs, dpstrf
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, Floats
@@ -138,14 +137,21 @@ def _rows(
 
 
 @dataclass(frozen=True)
-class _Normal:
-    """Normal equations of one class: G (p, p), B (p, n), T (n, n) without and S with the mean, number of rows."""
+class Normal:
+    """Normal equations of the m classes.
 
+    matrix : G (m, p, p). mixed : B (m, p, n). scatter, square : T (m, n, n) without and S with the mean.
+    """
+
+    classes: tuple[Class, ...]
     matrix: Floats
     mixed: Floats
     scatter: Floats
     square: Floats
-    count: int
+
+    def total(self, weight: Mapping[Class, float]) -> Floats:
+        """Weighted sum of the matrices, (p, p)."""
+        return np.tensordot([weight[key] for key in self.classes], self.matrix, 1)
 
 
 @dataclass(frozen=True)
@@ -223,15 +229,20 @@ class Redundancy:
         first += _JOINT * self.chain.n if "joint" in self.sides else 0
         return first + _MOTOR * joint + ("Ia", "Fvm", "Fcm", "offm").index(symbol)
 
+    @property
+    def width(self) -> int:
+        """Number p of parameters."""
+        joint, motor = "joint" in self.sides, "motor" in self.sides
+        drives = self.chain.n * (_JOINT * joint + _MOTOR * motor)
+        return _BODY * (self.chain.n + len(self.payloads)) + drives + motor * (1 + 3 * len(self.couplings))
+
     def matrix(self, rows: SampledRows) -> Floats:
         """Regressor (n, K, p) of one set of rows."""
         n = self.chain.n
-        payloads, sides = self.payloads, self.sides
-        joint, motor = "joint" in sides, "motor" in sides
+        payloads, joint = self.payloads, "joint" in self.sides
         rigid = rigid_regressor(self.chain, rows.q, rows.qd, rows.qdd)
         first = _BODY * (n + len(payloads))
-        width = first + n * (_JOINT * joint + _MOTOR * motor) + motor + 3 * len(self.couplings) * motor
-        out = np.zeros((n, len(rows.q), width))
+        out = np.zeros((n, len(rows.q), self.width))
         out[:, :, : _BODY * n] = rigid
         if rows.payload is not None:
             start = _BODY * (n + payloads.index(rows.payload))
@@ -255,68 +266,74 @@ class Redundancy:
                 out[[a, b], :, at + 2] = rows.coupled[:, k]
         return out
 
-    def normal(self) -> dict[Class, _Normal]:
+    def normal(self) -> Normal:
         """Normal equations by class, the silent ones left out."""
-        parts: dict[Class, list[tuple[Floats, Floats, Floats, Floats, int]]] = {}
+        n = self.chain.n
+        classes = [(side, j) for side in self.sides for j in range(n)]
+        place = {key: k for k, key in enumerate(key for key in classes if key not in self.silent)}
+        width = self.width
+        matrix, mixed = np.zeros((len(place), width, width)), np.zeros((len(place), width, n))
+        scatter, square = np.zeros((2, len(place), n, n))
         for rows in self.rows:
-            matrix = self.matrix(rows)
             centred = rows.torque - rows.torque.mean(axis=0)
-            scatter, square = centred.T @ centred, rows.torque.T @ rows.torque
-            for j, own in enumerate(matrix):
-                if (rows.side, j) not in self.silent:
-                    item = (own.T @ own, own.T @ rows.torque, scatter, square, len(own))
-                    parts.setdefault((rows.side, j), []).append(item)
-        return {
-            key: _Normal(*(sum(part[k] for part in items) for k in range(5)))  # type: ignore[arg-type]
-            for key, items in parts.items()
-        }
+            for j, own in enumerate(self.matrix(rows)):
+                if (k := place.get((rows.side, j))) is None:
+                    continue
+                # A joint's torque has the bodies behind it and its own drive alone.
+                used = np.flatnonzero(own.any(axis=0))
+                part = own[:, used]
+                matrix[k][np.ix_(used, used)] += part.T @ part
+                mixed[k, used] += part.T @ rows.torque
+                scatter[k] += centred.T @ centred
+                square[k] += rows.torque.T @ rows.torque
+        return Normal(tuple(place), matrix, mixed, scatter, square)
 
     def enough(self, share: float) -> bool:
         """Whether there are `share` rows for each parameter."""
         count = sum(len(rows.q) for rows in self.rows) * self.chain.n - len(self.silent)
-        return count >= share * self.matrix(self.rows[0].thinned(len(self.rows[0].q))).shape[2]
+        return count >= share * self.width
 
     def map_of(self, side: str) -> Floats:
         """(n, n), true torque = map @ measured torque."""
         return self.maps.get(side, np.eye(self.chain.n))
 
-    def fit(self, normal: Mapping[Class, _Normal] | None = None, *, doubtful: bool = True) -> Fit:
+    def fit(self, normal: Normal | None = None, *, doubtful: bool = True) -> Fit:
         """Weighted least squares, each class weighted by its own residual.
 
         normal : of rows with different `maps` only. doubtful : whether a torque may be in a wrong unit.
         """
         normal = self.normal() if normal is None else normal
-        chosen = {side: self.map_of(side) for side in self.sides}
-        mixed = {key: own.mixed @ chosen[key[0]][key[1]] for key, own in normal.items()}
-        size = {
-            key: tuple(
-                float(chosen[key[0]][key[1]] @ part @ chosen[key[0]][key[1]])
-                for part in (own.scatter, own.square)
-            )
-            for key, own in normal.items()
-        }
-        total = {key: max(scatter, 1e-12 * max(square, 1e-12)) for key, (scatter, square) in size.items()}
-        common = max(total.values(), default=1.0)
+        chosen = np.array([self.map_of(side)[joint] for side, joint in normal.classes])
+        chosen = chosen.reshape(-1, self.chain.n)
+        mixed = np.einsum("kpn,kn->kp", normal.mixed, chosen)
+        scatter, square = (
+            np.einsum("kn,knm,km->k", chosen, part, chosen) for part in (normal.scatter, normal.square)
+        )
+        total = np.maximum(scatter, 1e-12 * np.maximum(square, 1e-12))
+        common = np.full_like(total, np.max(total, initial=0.0) or 1.0)
+        least = FLOOR**2 * total
+        count, width, _ = normal.matrix.shape
+        flat = normal.matrix.reshape(count * width, width)
         fits = []
         # A torque in a wrong unit is far too heavy or far too light in one of these starts.
-        for start in (total, dict.fromkeys(total, common))[: 1 + doubtful]:
-            weight, error, values = (
-                {key: 1.0 / value for key, value in start.items()},
-                dict(total),
-                np.zeros(0),
-            )
+        for start in (total, common)[: 1 + doubtful]:
+            weight, error, values = 1.0 / start, total, np.zeros(0)
             for _ in range(_ROUNDS):
-                matrix = sum(weight[key] * own.matrix for key, own in normal.items())
-                right = sum(weight[key] * mixed[key] for key in normal)
-                values = _solve(np.asarray(matrix), np.asarray(right))
-                for key, own in normal.items():
-                    rest = size[key][1] - 2.0 * values @ mixed[key] + values @ own.matrix @ values
-                    error[key] = max(float(rest), 0.0)
-                weight = {key: 1.0 / max(error[key], FLOOR**2 * total[key]) for key in normal}
-            fits.append(Fit(values, {key: float(np.sqrt(error[key] / total[key])) for key in normal}, weight))
+                values = _solve((weight @ flat.reshape(count, -1)).reshape(width, width), weight @ mixed)
+                fitted = (flat @ values).reshape(count, width) @ values
+                error = np.maximum(square - 2.0 * mixed @ values + fitted, 0.0)
+                weight = 1.0 / np.maximum(error, least)
+            rho = np.sqrt(error / total)
+            fits.append(
+                Fit(
+                    values,
+                    dict(zip(normal.classes, rho.tolist(), strict=True)),
+                    dict(zip(normal.classes, weight.tolist(), strict=True)),
+                )
+            )
         return min(fits, key=lambda fit: fit.score)
 
-    def gains(self, fit: Fit, normal: Mapping[Class, _Normal]) -> dict[Class, Gain]:
+    def gains(self, fit: Fit, normal: Normal) -> dict[Class, Gain]:
         """Gain of each class against its torque computed from the shared parameters.
 
         The computed torque z of the class is an added column; its projection on the others is taken off, so the
@@ -324,19 +341,19 @@ class Redundancy:
         """
         shared = np.zeros_like(fit.parameters)
         shared[: _BODY * (self.chain.n + len(self.payloads))] = 1.0
-        total = sum(fit.weight[key] * own.matrix for key, own in normal.items())
+        total = normal.total(fit.weight)
         matrices = [self.matrix(rows) for rows in self.rows]
         result = {}
-        for key, own in normal.items():
-            part = shared * fit.parameters
-            others = _solve(np.asarray(total), fit.weight[key] * (own.matrix @ part))
+        part = shared * fit.parameters
+        for key, own in zip(normal.classes, normal.matrix, strict=True):
+            others = _solve(total, fit.weight[key] * (own @ part))
             den = num = spread = before = after = 0.0
             scores: list[tuple[Floats, Floats, float]] = []
             for rows, matrix in zip(self.rows, matrices, strict=True):
                 measured = rows.torque @ self.map_of(rows.side).T
                 for j, own_rows in enumerate(matrix):
                     place = (rows.side, j)
-                    if place not in normal:
+                    if place not in fit.weight:
                         continue
                     column = (own_rows @ part if place == key else 0.0) - own_rows @ others
                     error = measured[:, j] - own_rows @ fit.parameters
@@ -359,15 +376,15 @@ class Redundancy:
             )
         return result
 
-    def deviation(self, fit: Fit, normal: Mapping[Class, _Normal], directions: Floats) -> Floats:
+    def deviation(self, fit: Fit, normal: Normal, directions: Floats) -> Floats:
         """Standard deviation (m,) of the combinations `directions` (m, p) of the parameters, by blocks of rows."""
-        total = np.asarray(sum(fit.weight[key] * own.matrix for key, own in normal.items()))
+        total = normal.total(fit.weight)
         spreads = np.column_stack([_solve(total, direction) for direction in directions])
         variance = np.zeros(len(directions))
         for rows in self.rows:
             measured = rows.torque @ self.map_of(rows.side).T
             for j, own in enumerate(self.matrix(rows)):
-                if (rows.side, j) in normal:
+                if (rows.side, j) in fit.weight:
                     error = measured[:, j] - own @ fit.parameters
                     product = fit.weight[rows.side, j] * (own @ spreads) * error[:, None]
                     blocks = np.add.reduceat(product, np.arange(0, len(product), _BLOCK), axis=0)
@@ -379,8 +396,9 @@ def _solve(matrix: Floats, right: Floats) -> Floats:
     """Solution of the normal equations in the excited columns (Cholesky with pivots), zero in the others."""
     scale = np.sqrt(np.diag(matrix))
     scale = np.where(scale > 1e-150, scale, np.inf)
-    factor, order, rank, _ = dpstrf(matrix / scale[:, None] / scale[None, :], tol=_DEPENDENT)
+    # Column-major as LAPACK has it; the matrix is symmetric.
+    factor, order, rank, _ = dpstrf((matrix / (scale[:, None] * scale)).T, tol=_DEPENDENT, overwrite_a=1)
     kept = order[:rank] - 1
     found = np.zeros(len(right))
-    found[kept] = cho_solve((factor[:rank, :rank], False), (right / scale)[kept]) / scale[kept]
+    found[kept] = dpotrs(factor[:rank, :rank], (right / scale)[kept])[0].ravel() / scale[kept]
     return found

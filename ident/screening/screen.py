@@ -12,9 +12,8 @@ The thresholds lie between the scores of true faults and of wrong explanations o
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +28,7 @@ from ident.rows.sessions import payload_name
 from ident.screening.channels import check_channels, check_limits, dead
 from ident.screening.doubts import Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, explain, is_wrong, unit_of
-from ident.screening.redundancy import Class, Fit, Redundancy
+from ident.screening.redundancy import Class, Fit, Normal, Redundancy
 from lwr_driver.session import Session, Sessions, as_sessions
 
 logger = logging.getLogger(__name__)
@@ -246,7 +245,7 @@ def _inertia(chain: Chain, q: Floats, bodies: Floats) -> Floats:
     return _inertia_rows(chain, q) @ bodies
 
 
-def _physics(data: Redundancy, fit: Fit, normal: Mapping[Class, Any]) -> list[Doubt]:
+def _physics(data: Redundancy, fit: Fit, normal: Normal) -> list[Doubt]:
     """Inertia clearly negative, and gravity of another order than the URDF's."""
     n, names = data.chain.n, data.chain.joint_names
     bodies = len(INERTIAL) * n

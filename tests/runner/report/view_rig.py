@@ -18,6 +18,9 @@ FLAGS = [
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    # Pages drawn by the processor itself, not by an emulated graphics card; 3D views still take the latter.
+    "--disable-gpu-rasterization",
+    "--disable-gpu-compositing",
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 ]
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
