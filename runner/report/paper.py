@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -146,7 +147,8 @@ def new_figure(width: float, height: float, *, shown: bool) -> Any:
 def write_figure(figure: Any, path: str | Path, title: str, description: str = "") -> Path:
     """Write a matplotlib figure in the format of the suffix, the same file for the same figure.
 
-    PGF needs no LaTeX on this computer; the text takes the fonts of the document that includes it.
+    PGF needs no LaTeX on this computer; the text takes the fonts of the document that includes it, and an image goes to
+    a PNG beside it.
     """
     target = checked_target(path)
     suffix = target.suffix.lower()
@@ -156,11 +158,14 @@ def write_figure(figure: Any, path: str | Path, title: str, description: str = "
         ".png": {"Title": title, "Description": description, "Software": None},
         ".pgf": {},
     }
-    draft = target.with_name(f".{target.stem}.part{suffix}")
     kind = {"format": suffix[1:], **({"metadata": metadata[suffix]} if metadata[suffix] else {})}
-    with paper_style(), _without_latex() if suffix == ".pgf" else _plain():
-        figure.savefig(draft, **kind)
-    return draft.replace(target)
+    with TemporaryDirectory(prefix=".", dir=target.parent) as drafts:
+        with paper_style(), _without_latex() if suffix == ".pgf" else _plain():
+            figure.savefig(Path(drafts) / target.name, **kind)
+        # PGF refers to images in files of their own beside it.
+        for draft in sorted(Path(drafts).iterdir(), key=lambda one: one.suffix == suffix):
+            draft.replace(target.with_name(draft.name))
+    return target
 
 
 def draw_panels(
@@ -421,18 +426,21 @@ def _plain() -> Iterator[None]:
 
 @contextmanager
 def _without_latex() -> Iterator[None]:
-    """Text measured by matplotlib while PGF is written, where no LaTeX is installed to do it."""
+    """PGF written where no LaTeX is installed to measure text and try how images are included."""
     import matplotlib
     from matplotlib.backend_bases import RendererBase
-    from matplotlib.backends.backend_pgf import RendererPgf
+    from matplotlib.backends import backend_pgf
 
     if shutil.which(matplotlib.rcParams["pgf.texsystem"]):
         yield
         return
-    renderer: Any = RendererPgf
-    measure = renderer.get_text_width_height_descent
+    module: Any = backend_pgf
+    renderer = module.RendererPgf
+    measure, inclusion = renderer.get_text_width_height_descent, module._get_image_inclusion_command
     renderer.get_text_width_height_descent = RendererBase.get_text_width_height_descent
+    module._get_image_inclusion_command = lambda: r"\includegraphics"
     try:
         yield
     finally:
         renderer.get_text_width_height_descent = measure
+        module._get_image_inclusion_command = inclusion

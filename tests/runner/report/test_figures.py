@@ -94,6 +94,16 @@ def test_pgf_takes_the_fonts_of_the_document_without_latex_here(
     assert "Joint 1" in text
 
 
+def test_an_image_in_pgf_goes_to_a_file_beside_it_without_latex_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    matrix = MatrixFigure("m", "correlations", tuple("abc"), np.eye(3))
+    text = matrix.save(tmp_path / "m.pgf").read_text()
+    assert "{m-img0.png}" in text
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m-img0.png", "m.pgf"]
+
+
 @pytest.mark.parametrize(
     ("name", "width", "message"),
     [
