@@ -26,7 +26,7 @@ class Hand:
         self.external, self.allowed = np.zeros(7), np.full(7, 10.0)
         self.contact: Contact | None = None
         self.stale: Stale | None = None
-        self.carried: list[float] = []
+        self.carried: list[list[float]] = []
 
     def set_period(self, period_s: float) -> None:
         pass
@@ -35,7 +35,7 @@ class Hand:
         pass
 
     def carry(self, mass: float, com: np.ndarray, inertia: np.ndarray) -> None:
-        self.carried.append(mass)
+        self.carried.append([mass, *com, *inertia])
 
     def update(self, *_: object) -> Contact | None:
         return self.contact
@@ -227,13 +227,16 @@ def test_contact_during_a_stop_on_request_is_told_and_bars(rig):
 def test_payload_reaches_the_watch_while_the_arm_rests(rig):
     r = rig()
     in_motion(r)
-    r.control.load[0] = 3.34
+    load = [3.34, 0.01, -0.07, 0.14, 0.02, 0.03, 0.04]
+    r.control.load[:] = load
     r.control.words[Word.LOAD] += 1
     r.cycles(3)
     assert hand(r).carried == []
     r.until_done()
     r.cycles(2)
-    assert hand(r).carried == [3.34]
+    assert hand(r).carried == [load]
+    r.cycles(2)
+    assert hand(r).carried == [load]
 
 
 def test_contact_after_the_answer_has_left_stops_with_the_next_packet(rig):
