@@ -274,19 +274,18 @@ def habit(
     )
     usual = np.array([_USUAL.get(symbol, _ELSE) for symbol in symbols])
     groups = [symbol if symbol in (*_USUAL, *_OFFSETS, "Ia") else "" for symbol in symbols]
-    variance = np.zeros(len(names))
+    squares, variance = np.nansum((values - mean) ** 2, axis=0), np.zeros(len(names))
     for group in dict.fromkeys(groups):
         mine = np.array([g == group for g in groups])
         # A parameter less certain than its usual change tells nothing of habits.
         telling = mine & (own < (usual * scale) ** 2) & (scale > 0.0)
         changes = int(np.sum(count[telling] - 1))
-        scatter = np.nansum((values[:, telling] - mean[telling]) ** 2, axis=0)
-        scatter = scatter - (count[telling] - 1) * own[telling]
+        scatter = squares[telling] - (count[telling] - 1) * own[telling]
         total = max(float(np.sum(scatter / scale[telling] ** 2)), 0.0)
         share = (_USUAL_CHANGES * usual[mine][0] ** 2 + total) / (_USUAL_CHANGES + changes)
         variance[mine] = share * scale[mine] ** 2
         expected = own[mine] + variance[mine]
-        excess = np.nansum((values[:, mine] - mean[mine]) ** 2, axis=0) / np.maximum(expected, 1e-300)
+        excess = squares[mine] / np.maximum(expected, 1e-300)
         common = max((_ALIKE + excess.sum()) / (_ALIKE + np.sum(count[mine] - 1)), 1.0)
         each = (_ALIKE * common + excess) / (_ALIKE + count[mine] - 1)
         variance[mine] += np.maximum(each - 1.0, 0.0) * own[mine]
