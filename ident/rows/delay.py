@@ -13,6 +13,7 @@ Ia by -Fvm d, so its uncertainty enters the covariance of every estimate.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,7 @@ from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem, RowGroup
 from ident.rows.filters import ParallelFilter, half_width, interpolate_uniform, low_pass
-from lwr_driver.session.spool import Growing, release
+from lwr_driver.session.spool import Growing, release, spans
 
 logger = logging.getLogger(__name__)
 
@@ -48,6 +49,10 @@ _ELASTIC_S = 2e-3
 _DECISIVE = 25.0
 # A delay within this many standard deviations of zero is not told apart from zero.
 _DISTINCT = 1.96
+# Arrays of `DelayData`.
+_ARRAYS = ("times", "qd", "qdd", "joint_torque", "known", "motor_times", "motor_torque")
+# Latest estimates by the digest of their data: an estimator prepares a session several times.
+_MOST_ESTIMATES = 64
 
 
 @dataclass(frozen=True)
@@ -102,6 +107,9 @@ class Delay:
         return f"late by {1e3 * self.seconds:.2f} ms ({low:.2f} to {high:.2f} ms, {self.how})"
 
 
+_estimates: dict[bytes, Delay] = {}
+
+
 @dataclass(frozen=True)
 class DelayData:
     """One uninterrupted stretch or a block of it: joint channel on (n,) even times, motor channel on (m,) times [s].
@@ -129,11 +137,41 @@ def estimate_delay(
     cutoff_hz: float = 5.0,
     search_s: float = 0.1,
 ) -> Delay:
-    """Delay d of the motor channel: tau_m(t + d) belongs to the joint state at t.
+    """Delay d of the motor channel: tau_m(t + d) belongs to the joint state at t; of equal data estimated once.
 
     A motion too short or too weak for an estimate gives zero, with the sample time of the motor channel as its
     standard deviation. Raises DataError when the data clearly prefer a delay at the edge of +- `search_s`.
     """
+    key = _identity(stretches, (tuple(joint_names), cutoff_hz, search_s))
+    found = _estimates.pop(key, None) or _estimated(stretches, joint_names, cutoff_hz, search_s)
+    _estimates[key] = found
+    while len(_estimates) > _MOST_ESTIMATES:
+        _estimates.pop(next(iter(_estimates)))
+    logger.info("motor channel %s", found)
+    return found
+
+
+def _identity(stretches: Sequence[DelayData], rest: object) -> bytes:
+    """Digest of the data and of the other arguments of an estimate."""
+    known: dict[int, bytes] = {}  # blocks of a stretch share the arrays of the motor channel
+    whole = hashlib.blake2b(repr(rest).encode(), digest_size=16)
+    for data in stretches:
+        whole.update(repr((data.span, data.core)).encode())
+        for name in _ARRAYS:
+            array = getattr(data, name)
+            if id(array) not in known:
+                own = hashlib.blake2b(repr((array.shape, array.dtype)).encode(), digest_size=16)
+                for some in spans(len(array)):
+                    own.update(np.ascontiguousarray(array[some]))
+                release(array)
+                known[id(array)] = own.digest()
+            whole.update(known[id(array)])
+    return whole.digest()
+
+
+def _estimated(
+    stretches: Sequence[DelayData], joint_names: Sequence[str], cutoff_hz: float, search_s: float
+) -> Delay:
     by_stretch = [list(blocks) for _, blocks in groupby(stretches, key=lambda data: data.span)]
     parts = [part for blocks in by_stretch if (part := _Rows.of(blocks, cutoff_hz, search_s)) is not None]
     joints = [
@@ -170,9 +208,7 @@ def estimate_delay(
         joint_names[j]: (delay + float(step), float(s))
         for j, step, s in zip(joints, steps, stds, strict=True)
     }
-    found = Delay.of(delay, std * disagreement, "from the torque difference", by_joint, disagreement)
-    logger.info("motor channel %s", found)
-    return found
+    return Delay.of(delay, std * disagreement, "from the torque difference", by_joint, disagreement)
 
 
 def _unknown(stretches: Sequence[DelayData], why: str) -> Delay:

@@ -137,6 +137,8 @@ class SignalSettings:
 _FIRST = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
 _SECOND = np.array([2.0, -27.0, 270.0, -490.0, 270.0, -27.0, 2.0]) / 180.0
 _OUTPUTS = 8
+# Weights that a filter keeps, at most: 8 MB.
+_MOST_KEPT = 2**20
 
 
 def low_pass(values: Floats, dt: float, cutoff_hz: float, order: int = 4) -> Floats:
@@ -251,7 +253,7 @@ class ParallelFilter:
         """Filtered (K, ...) of values (m, ...)."""
         flat = values.reshape(len(values), -1)
         result = np.empty((len(self.outputs), flat.shape[1]))
-        for rows, samples, weights in self.blocks():
+        for rows, samples, weights in self._kept or self.blocks():
             result[rows] = weights @ flat[samples]
         return result.reshape(len(self.outputs), *values.shape[1:])
 
@@ -280,6 +282,21 @@ class ParallelFilter:
         for rows, samples, kernel in self._kernels(size):
             total = kernel.sum(axis=1, keepdims=True)
             yield rows, samples, kernel / np.where(total != 0.0, total, 1.0)
+
+    @cached_property
+    def _kept(self) -> list[tuple[slice, slice, Floats]]:
+        """The blocks for every use, where they share kernels; none where they would take much memory."""
+        kernels: dict[int, tuple[Floats, Floats]] = {}
+        found, size = [], 0
+        for rows, samples, kernel in self._kernels():
+            if id(kernel) not in kernels:
+                size += kernel.size
+                if size > _MOST_KEPT:
+                    return []
+                total = kernel.sum(axis=1, keepdims=True)
+                kernels[id(kernel)] = kernel, kernel / np.where(total != 0.0, total, 1.0)
+            found.append((rows, samples, kernels[id(kernel)][1]))
+        return found
 
     def _kernels(self, size: int = _OUTPUTS) -> Iterator[tuple[slice, slice, Floats]]:
         """Like `blocks`, not normalised. On a regular grid equal offsets share one kernel."""
