@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import ident.rows.delay as module
 from fri.errors import DataError
 from ident.rows.delay import Delay, DelayData, estimate_delay
 from ident.rows.filters import SignalSettings, differentiate
@@ -113,3 +114,26 @@ def test_a_stated_delay_is_taken_and_motor_torques_alone_have_none():
     joint = replace(session.joint, effort=session.joint.effort[:, :0])
     alone = prepare(replace(session, joint=joint)).delay
     assert (alone.seconds, alone.std) == (0.0, 0.0)
+
+
+def test_equal_data_are_estimated_once_and_each_other_argument_anew(monkeypatch: pytest.MonkeyPatch):
+    calls: list[tuple[object, ...]] = []
+
+    def estimated(*arguments: object) -> Delay:
+        calls.append(arguments)
+        return Delay(1e-3 * len(calls), 1e-4, "counted")
+
+    monkeypatch.setattr(module, "_estimates", {})
+    monkeypatch.setattr(module, "_estimated", estimated)
+    first, joints = data(0.01, seconds=8.0), ("A1", "A2")
+    assert estimate_delay([first], joints) == estimate_delay([data(0.01, seconds=8.0)], joints)
+    assert len(calls) == 1
+    torque = first.motor_torque.copy()
+    torque[-1, -1] += 1e-9
+    others = [replace(first, motor_torque=torque), replace(first, span=(first.span[0], first.span[1] - 1e-3))]
+    for number, other in enumerate(others, start=2):
+        assert estimate_delay([other], joints).seconds == pytest.approx(1e-3 * number)
+    estimate_delay([first], joints, cutoff_hz=4.0)
+    estimate_delay([first], joints, search_s=0.05)
+    estimate_delay([first], ("A1", "E1"))
+    assert len(calls) == 6

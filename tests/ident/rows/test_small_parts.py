@@ -11,6 +11,7 @@ from scipy.signal import butter
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.structure import ModelStructure
+from ident.rows import filters
 from ident.rows.binned import bins
 from ident.rows.filters import (
     Excitation,
@@ -591,3 +592,16 @@ def test_payload_and_mass_are_read_from_the_metadata():
     require(1, int, "n", "count")
     with pytest.raises(ConfigurationError, match="`n` must be of type int, not str 'one'; count"):
         require("one", int, "n", "count")
+
+
+@pytest.mark.parametrize("step_s", [0.0, 1e-5], ids=["even", "uneven"])
+@pytest.mark.parametrize("most", [0, 2**20], ids=["made anew", "kept"])
+def test_a_filter_gives_the_same_on_each_use_whether_its_weights_are_kept(
+    monkeypatch: pytest.MonkeyPatch, step_s: float, most: int
+):
+    monkeypatch.setattr(filters, "_MOST_KEPT", most)
+    times = np.arange(2000) * 0.004 + step_s * np.sin(np.arange(2000))
+    parallel = ParallelFilter(times, np.arange(1.0, 7.0, 0.1), 2.0)
+    for values in (np.sin(times)[:, None], np.cos(3.0 * times)[:, None]):
+        rows = [weights @ values[samples] for _, samples, weights in parallel.blocks()]
+        assert np.array_equal(parallel.apply(values), np.concatenate(rows))
