@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from ident.rows.delay import Delay, DelayData, estimate_delay
+from ident.rows.delay import Delay, DelayData, _misfit, _Rows, estimate_delay
 from ident.rows.filters import SignalSettings, differentiate
 from ident.rows.prepare import prepare
 from tests.ident import estimation_arm as arm
@@ -113,3 +113,22 @@ def test_a_stated_delay_is_taken_and_motor_torques_alone_have_none():
     joint = replace(session.joint, effort=session.joint.effort[:, :0])
     alone = prepare(replace(session, joint=joint)).delay
     assert (alone.seconds, alone.std) == (0.0, 0.0)
+
+
+def test_rows_take_every_sample_and_the_coarse_search_forty_a_period():
+    rows = _Rows.of([data(0.0)], 1.0, 0.1)
+    assert rows is not None
+    assert (rows.step_s, rows.row_s) == (pytest.approx(MOTOR_DT), pytest.approx(0.4))
+    (block,) = rows.blocks
+    assert block.inside.step == 1
+    # 40 Hz of the 100 Hz, and of 100 Hz nothing to leave out beyond 1.25 Hz.
+    assert rows.thinned(1.0).blocks[0].inside.step == 2
+    assert rows.thinned(1.3) is rows
+
+
+def test_joints_without_a_known_row_have_no_part_in_the_search():
+    whole = data(0.0)
+    rows = [_Rows.of([replace(whole, known=whole.known * some)], 5.0, 0.1) for some in (True, [True, False])]
+    both, one = (_misfit([part], [0, 1], 0.0) for part in rows)
+    assert one == pytest.approx(_misfit(rows[:1], [0], 0.0))
+    assert both == pytest.approx(one + _misfit(rows[:1], [1], 0.0))
