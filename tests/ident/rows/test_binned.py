@@ -76,3 +76,11 @@ def test_a_side_without_a_channel_has_no_bins():
     assert [rows.side for rows in observe_bins(alone, None, STRUCTURE, COLUMNS, 0.02)] == ["joint"]
     coarse = observe_bins(alone, None, replace(STRUCTURE, sides=("joint",)), COLUMNS, 1e-4)
     assert coarse[0].width == 1
+
+
+def test_a_single_sample_between_the_rows_has_no_bin(prepared: PreparedSession):
+    (passage,) = prepared.passages
+    for count, bins_found in ((1, 0), (2, 1)):
+        short = replace(passage, rows=passage.joint.times[100 : 100 + count], motor=None)
+        found = observe_bins(replace(prepared, passages=(short,)), None, STRUCTURE, COLUMNS, 0.008)
+        assert [len(rows.time) for rows in found] == [1] * bins_found

@@ -9,7 +9,7 @@ import pytest
 
 import ident.rows.delay as module
 from fri.errors import DataError
-from ident.rows.delay import Delay, DelayData, estimate_delay
+from ident.rows.delay import Delay, DelayData, _misfit, _Rows, estimate_delay
 from ident.rows.filters import SignalSettings, differentiate
 from ident.rows.prepare import prepare
 from tests.ident import estimation_arm as arm
@@ -137,3 +137,22 @@ def test_equal_data_are_estimated_once_and_each_other_argument_anew(monkeypatch:
     estimate_delay([first], joints, search_s=0.05)
     estimate_delay([first], ("A1", "E1"))
     assert len(calls) == 6
+
+
+def test_rows_take_every_sample_and_the_coarse_search_forty_a_period():
+    rows = _Rows.of([data(0.0)], 1.0, 0.1)
+    assert rows is not None
+    assert (rows.step_s, rows.row_s) == (pytest.approx(MOTOR_DT), pytest.approx(0.4))
+    (block,) = rows.blocks
+    assert block.inside.step == 1
+    # 40 Hz of the 100 Hz, and of 100 Hz nothing to leave out beyond 1.25 Hz.
+    assert rows.thinned(1.0).blocks[0].inside.step == 2
+    assert rows.thinned(1.3) is rows
+
+
+def test_joints_without_a_known_row_have_no_part_in_the_search():
+    whole = data(0.0)
+    rows = [_Rows.of([replace(whole, known=whole.known * some)], 5.0, 0.1) for some in (True, [True, False])]
+    both, one = (_misfit([part], [0, 1], 0.0) for part in rows)
+    assert one == pytest.approx(_misfit(rows[:1], [0], 0.0))
+    assert both == pytest.approx(one + _misfit(rows[:1], [1], 0.0))

@@ -12,7 +12,7 @@ from ident.dynamics.structure import DriveMotion
 from ident.rows import observation
 from ident.rows.binned import _add_means, bins
 from ident.rows.delay import Delay, DelayData, estimate_delay
-from ident.rows.filters import SignalSettings, low_pass
+from ident.rows.filters import SignalSettings, half_width, low_pass, settling
 from ident.rows.prepare import (
     Passage,
     TorqueChannel,
@@ -24,8 +24,8 @@ from ident.rows.prepare import (
     clock_ns,
     prepare,
 )
-from ident.rows.signal_choice import _Bench, _excerpt, _reversal_s, _Rows
-from ident.rows.timebase import stretches
+from ident.rows.signal_choice import _Bench, _excerpt, _reversal_s, _Rows, _with_decimation
+from ident.rows.timebase import flag_outliers, stretches
 from lwr_driver.session import Phase
 from tests.ident import estimation_arm as arm
 
@@ -235,6 +235,10 @@ def test_blocks_cover_a_stretch_once_and_overlap_by_the_reach_of_their_filters()
         first = round((begin + 0.0005) / 0.001)
         assert ((first - 200) % 12, (first - low) % 12) == (0, 0)
         assert high == 600_001 or (high - 200) % 12 == (first - low) % 12
+    # A wide band of the rows: the delay reaches farther, over its kernel, its search and its low-pass.
+    (_, ((low, _), (begin, _)), *_) = _cut(part, SignalSettings(decimate_hz=8.0).settled(100.0), True)
+    reach = half_width(5.0, 40.0) + 0.1 + settling(15.0)
+    assert begin - 0.01 * low == pytest.approx(reach + 0.5, abs=0.011)
     short = replace(part, count=24_039)
     assert len(list(_cut(short, settings, True))) == 1
     assert len(list(_cut(replace(part, count=24_041), settings, True))) == 2
@@ -313,6 +317,17 @@ def test_an_earlier_filter_over_the_widest_window_leaves_the_reversals_in() -> N
         assert ("nothing left out" in said[0]) == nothing
 
 
+@pytest.mark.parametrize(("motor", "band"), [(True, True), (False, False)])
+def test_an_earlier_filter_of_the_motor_torques_counts_where_these_are_used(motor: bool, band: bool) -> None:
+    session = arm.session(sensors=arm.Sensors(position=1e-6, joint=0.05, motor=0.1), period_s=4.0)
+    spectrum = np.fft.rfft(session.motor.effort, axis=0)
+    spectrum[np.fft.rfftfreq(len(session.motor), 0.004) > 8.0] = 0.0
+    smooth = np.fft.irfft(spectrum, len(session.motor), axis=0)
+    session = replace(session, motor=replace(session.motor, effort=smooth))
+    found = _with_decimation(FIVE_HZ, [session], 250.0, motor, [], flag_outliers)
+    assert found == (FIVE_HZ, pytest.approx(8.0, abs=0.5) if band else None)
+
+
 def test_an_excerpt_begins_with_the_motion_and_ends_with_the_recording() -> None:
     session = arm.session(motor=True, run_in_s=3.0, period_s=4.0, periods=2)
     assert _excerpt(session, 14.0) is session
@@ -346,3 +361,52 @@ def test_elastic_joints_look_early_by_two_milliseconds(estimate: float, early: b
     assert Delay(0.0, 0.0, "how").interval == (0.0, 0.0)
     assert (Delay(0.0, 0.0, "how").estimate, Delay(0.0, 0.0, "how").disagreement) == (0.0, 1.0)
     assert Delay(0.001, 0.002, "how").interval == (0.0, pytest.approx(0.001 + 1.96 * 0.002))
+
+
+def test_a_still_joint_loses_all_its_rows_and_the_others_none() -> None:
+    session = arm.session(still=(2,), period_s=6.0)
+    counts = prepare(session, SignalSettings(motor_delay_s=0.0, reversal_s=0.0)).counts
+    assert counts["rows"] > 50
+    for side in ("joint", "motor"):
+        assert counts[f"{side}_rows_dropped"] == counts["rows"]
+
+
+def test_the_sample_time_is_that_of_the_counter() -> None:
+    session = arm.session(motor=False, period_s=4.0)
+    # Every second sample is lost between two of the others.
+    kept = np.concatenate([np.arange(600), np.arange(600, len(session.joint), 2)])
+    fields = ("log_time", "publish_time", "sequence", "position", "velocity", "effort")
+    some = replace(session.joint, **{name: getattr(session.joint, name)[kept] for name in fields})
+    for sequence, period_s in ((some.sequence, 0.004), (np.zeros_like(some.sequence), 0.008)):
+        (passage,) = prepare(replace(session, joint=replace(some, sequence=sequence)), advise=False).passages
+        assert passage.joint.period_s == pytest.approx(period_s)
+
+
+def test_held_torques_of_the_joint_channel_are_counted_and_flagged() -> None:
+    session = arm.session(sensors=arm.Sensors(joint=0.02), period_s=4.0)
+    effort = session.joint.effort.copy()
+    effort[1200:1240] = effort[1199]
+    prepared = prepare(replace(session, joint=replace(session.joint, effort=effort)), advise=False)
+    assert prepared.counts["joint_torque_held"] == 40
+    (passage,) = prepared.passages
+    assert passage.joint.flagged.all(axis=1).sum() == 40
+    bare = replace(session.joint, effort=effort[:, :0])
+    assert prepare(replace(session, joint=bare), advise=False).counts["joint_torque_held"] == 0
+
+
+def test_advice_names_the_rates_of_both_channels() -> None:
+    settings = SignalSettings(cutoff_hz=9.0, decimate_hz=2.0, motor_delay_s=0.0)
+    session = arm.session(rate_hz=40.0, sensors=arm.Sensors(motor_step_s=0.25))
+    said = " ".join(prepare(session, settings).warnings)
+    assert "above a fifth of the sampling rate 40 Hz" in said
+    assert "rows at 5 Hz exceed the motor channel's 4.0 Hz" in said
+
+
+def test_a_commanded_motion_without_error_is_the_measured_one() -> None:
+    session = arm.session(motor=False, command=True, period_s=4.0)
+    prepared = prepare(session, advise=False)
+    motion = observation.commanded(session, prepared)
+    assert motion is not None
+    (measured,), (sent,) = prepared.passages, motion.passages
+    for name in ("q", "qd", "qdd"):
+        np.testing.assert_allclose(getattr(sent.joint, name), getattr(measured.joint, name), atol=1e-6)

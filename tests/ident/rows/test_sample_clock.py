@@ -35,6 +35,7 @@ def test_jittering_stamps_become_even_times(rate: float, jitter_s: float) -> Non
     error = (clock.times - true[kept])[np.abs(true[kept] - 10.0) > 1.0]
     assert np.std(error) < 0.2 * np.std(stamps - true[kept])
     assert clock.period_s * rate == pytest.approx(1.0, abs=1e-3)
+    assert clock.times[0] == stamps[0]
 
 
 def test_a_repeated_sample_is_told_and_the_one_after_a_lost_one_keeps_its_place() -> None:

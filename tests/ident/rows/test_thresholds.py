@@ -200,3 +200,10 @@ def test_stuck_torques_are_those_of_moving_joints() -> None:
     (found,) = stuck_at(columns(effort), columns(noisy(count=600), position))
     # The first sample has no speed.
     assert (found.joint, found.value, found.count, found.samples) == (1, 0.5, 40, 599)
+
+
+def test_two_fresh_samples_already_tell_the_usual_interval() -> None:
+    effort = np.repeat(noisy(count=2), [20, 180], axis=0)
+    times = np.arange(200) * 1e-3
+    # The first is kept for 20 samples, the second for nine times as long.
+    assert np.flatnonzero(held(effort, times, times, times[:, None])).tolist() == list(range(21, 200))
