@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fri.errors import DataError
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, doubted
@@ -18,6 +19,7 @@ from ident.diagnosis.held_out import held_out
 from ident.diagnosis.nominal import GAIN_STD, TRAVEL_RAD, Nominal
 from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import Reference
+from ident.diagnosis.refit import left_by, refitted
 from ident.diagnosis.result import Diagnosis, Finding, RowStates, Unexplained
 from ident.diagnosis.selection import GAIN
 from ident.diagnosis.task import Baseline, State, Task
@@ -84,6 +86,21 @@ def conclude(task: Task, state: State) -> Diagnosis:
         state.selection.nuisance,
         (*entries, *(e for term in nameless for e in term.entries)),
     )
+    added = extended.effects[len(base_model.effects) :]
+    own, notes = None, state.notes
+    if task.sound and evidence.drawn:
+        try:
+            own = refitted(task, nominal, added)
+        except DataError as error:
+            notes = (*notes, f"the models are those of the evidence, for `identify` says: {error}")
+    if own is not None:
+        base_model, extended = own
+        changes = _changes(base_model, extended) if added else {}
+        if nominal.held_out:
+            before, after = (
+                left_by(model, nominal, held) for model, held in zip(own, (before, after), strict=True)
+            )
+            extended_rms = after.rms()
     fitted = {(term.side, term.joint) for term in nameless}
     left = [
         (r.side, r.joint, r.depends_on)
@@ -104,7 +121,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         findings=tuple(f for f in findings if not is_character[id(f)]),
         character=tuple(f for f in findings if is_character[id(f)]),
         nameless=nameless,
-        extension=tuple(title(entry) for entry in extended.effects[len(base_model.effects) :]),
+        extension=tuple(title(entry) for entry in added),
         unexplained=tuple(
             Unexplained(
                 side, j, variables, float(extended_rms[side][j - 1]), float(evidence.floor[side][j - 1])
@@ -121,7 +138,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         nuisance=state.selection.nuisance,
         simulation_base=simulation,
         simulation_extended=extended_simulation,
-        notes=(*_notes(bench, task.reference), *_channel_notes(nominal, remainders), *state.notes),
+        notes=(*_notes(bench, task.reference), *_channel_notes(nominal, remainders), *notes),
         residuals={"base": before.residual, "extended": after.residual},
         states={side: _states(nominal, side, before.block[side]) for side in nominal.rows},
     )
@@ -161,11 +178,16 @@ def _models(
     )
     values, covariance = evidence.full.values[:p].copy(), evidence.covariance()[:p, :p]
     extended = replace(base, values=values, covariance=covariance, effects=(*base.effects, *effects))
-    assert extended.std is not None
+    return base, extended, _changes(base, extended) if effects else {}
+
+
+def _changes(base: DynamicModel, extended: DynamicModel) -> dict[str, float]:
+    """Largest changes of the base parameters beyond two standard deviations, in these; none between different bases."""
+    if extended.std is None or base.names != extended.names:
+        return {}
     shift = (extended.values - base.values) / np.maximum(extended.std, 1e-300)
     order = np.argsort(-np.abs(shift))[:10]
-    changes = {base.names[k]: float(shift[k]) for k in order if abs(shift[k]) > 2.0} if effects else {}
-    return base, extended, changes
+    return {base.names[k]: float(shift[k]) for k in order if abs(shift[k]) > 2.0}
 
 
 def _gains(nuisance: Mapping[str, tuple[float, float]]) -> list[dict[str, Any]]:

@@ -96,7 +96,9 @@ def diagnose(
         some_joint_moves(recordings)
         recordings = without_broken(recordings, broken)
         nominal = nominal_arm(chain, arm, reference)
-        task = Task(sessions, test, nominal, recordings, settings, reference, causes, model, simulate)
+        task = Task(
+            sessions, test, nominal, recordings, settings, reference, causes, model, simulate, not broken
+        )
         if worthless(broken):
             return _ended(task, broken)
         found = conclude(task, _refined(task, _in_time(task, _first(task))))

@@ -26,7 +26,8 @@ Simulate = Callable[[DynamicModel, "Sequence[Session]"], SimulationError | None]
 class Task:
     """The input of a diagnosis, see `diagnose`. sessions, test : as given. arm : the nominal arm.
 
-    causes : names to consider, None for all. model : the present model, None for the base model.
+    causes : names to consider, None for all. model : the present model, None for the base model. sound : whether no
+    channel is broken.
     """
 
     sessions: Sequence[Session]
@@ -38,6 +39,12 @@ class Task:
     causes: Sequence[str] | None
     model: DynamicModel | None
     simulate: Simulate | None
+    sound: bool = True
+
+    @property
+    def everything(self) -> list[Session]:
+        """Fitted and held-out sessions in the order of their beginnings, that of the recordings."""
+        return sorted([*self.sessions, *self.test], key=lambda s: s.start)
 
     @cached_property
     def null(self) -> Null | None:
