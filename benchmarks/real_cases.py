@@ -12,21 +12,17 @@ import tarfile
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.real_arms import ARMS, RealArm, low_passed_error
+from benchmarks.real_arms import ARMS, low_passed_error
 from fri.errors import LwrError
 from ident.diagnosis import ArmData, Diagnosis, diagnose
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling
-from ident.estimation.identify import AUTO, IdentificationSettings, identify
 from ident.import_log import LogMapping, import_log
-from ident.model import DynamicModel
-from ident.rows.filters import differentiate, low_pass
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
 
@@ -69,35 +65,7 @@ def unseen(data: Path) -> Iterator[tuple[str, str, Diagnosis]]:
                     for m in (found.base_model, found.extended_model)
                 )
                 print(f"  relative error over all joints below {band:g} Hz: {before:.2f} % -> {after:.2f} %")
-            _refitted(arm, chain, [sessions[name] for name in train], sessions[test], found.extended_model)
             yield arm.folder, test, found
-
-
-def _refitted(
-    arm: RealArm, chain: Chain, train: Sequence[Session], test: Session, extended: DynamicModel
-) -> None:
-    """The error of what `identify` makes of the joint torques without the causes that the diagnosis named."""
-    if not extended.effects or arm.model != 1:
-        return
-    settings = IdentificationSettings(model=1, estimator=AUTO, essential=None)
-    model = identify([_without(session, extended) for session in train], chain, settings).model
-    model = replace(model, effects=(*model.effects, *extended.effects))
-    errors = (f"below {band:g} Hz {low_passed_error(model, test, band):.2f} %" for band in (2.0, 10.0))
-    print(f"  `identify` of the torque without these causes, and they added: {', '.join(errors)}")
-
-
-def _without(session: Session, model: DynamicModel) -> Session:
-    """The session with joint torques free of a model's effects, positions low-passed at 8 Hz."""
-    joint = session.joint
-    times = 1e-9 * (joint.log_time - joint.log_time[0]).astype(np.float64)
-    dt = float(np.median(np.diff(times)))
-    q = low_pass(joint.position, dt, 8.0)
-    motion = (q, *differentiate(q, dt))
-    whole, bare = (
-        one.torque(*motion, side="joint", time=times, measured=True)
-        for one in (model, replace(model, effects=()))
-    )
-    return replace(session, joint=replace(joint, effort=joint.effort - (whole - bare)))
 
 
 def tx40(folder: Path) -> None:

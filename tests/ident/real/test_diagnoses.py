@@ -24,8 +24,8 @@ from tests.ident.real.real_lwr4 import DATA, EVERY, chain, mounted, needs_record
 
 SURE = 0.8
 SPLITS = [
-    pytest.param((3,), 1, 3.0, id="3 -> 1"),
-    pytest.param((1, 2), 3, 3.5, id="1, 2 -> 3", marks=pytest.mark.long),
+    pytest.param((3,), 1, 2.5, id="3 -> 1"),
+    pytest.param((1, 2), 3, 3.2, id="1, 2 -> 3", marks=pytest.mark.long),
 ]
 
 
@@ -61,7 +61,8 @@ def test_the_extended_model_predicts_the_run_that_was_not_used(train, test, boun
     found = diagnosis(train, test)
     before, after = (relative_percent(m, test) for m in (found.base_model, found.extended_model))
     assert after < bound
-    assert after < 0.85 * before
+    # The base model is that of `identify`, which finds the lean of the base by itself.
+    assert after < before
 
 
 @needs_recordings
