@@ -13,7 +13,7 @@ from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, doubted
 from ident.diagnosis.evidence import Floats
-from ident.diagnosis.extension import Member, extension, nameless_terms, title
+from ident.diagnosis.extension import Member, extension, nameless_terms, power_left, title
 from ident.diagnosis.findings import loss_finding
 from ident.diagnosis.held_out import held_out
 from ident.diagnosis.nominal import GAIN_STD, TRAVEL_RAD, Nominal
@@ -86,21 +86,22 @@ def conclude(task: Task, state: State) -> Diagnosis:
         state.selection.nuisance,
         (*entries, *(e for term in nameless for e in term.entries)),
     )
-    added = extended.effects[len(base_model.effects) :]
-    own, notes = None, state.notes
+    added = tuple(title(entry) for entry in extended.effects[len(base_model.effects) :])
+    notes = state.notes
     if task.sound and evidence.drawn:
         try:
-            own = refitted(task, nominal, added)
+            base_model, extended = refitted(task, nominal, extended.effects[len(base_model.effects) :])
         except DataError as error:
             notes = (*notes, f"the models are those of the evidence, for `identify` says: {error}")
-    if own is not None:
-        base_model, extended = own
-        changes = _changes(base_model, extended) if added else {}
-        if nominal.held_out:
-            before, after = (
-                left_by(model, nominal, held) for model, held in zip(own, (before, after), strict=True)
-            )
-            extended_rms = after.rms()
+        else:
+            if nominal.held_out:
+                before, after = (left_by(m, nominal, h) for m, h in ((base_model, before), (extended, after)))
+                if power_left(before, after) >= 1.0:
+                    extended, after = base_model, before
+                extended_rms = after.rms()
+            own = {title(entry) for entry in base_model.effects}
+            added = tuple(name for name in map(title, extended.effects) if name not in own)
+            changes = _changes(base_model, extended) if added else {}
     fitted = {(term.side, term.joint) for term in nameless}
     left = [
         (r.side, r.joint, r.depends_on)
@@ -121,7 +122,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         findings=tuple(f for f in findings if not is_character[id(f)]),
         character=tuple(f for f in findings if is_character[id(f)]),
         nameless=nameless,
-        extension=tuple(title(entry) for entry in added),
+        extension=added,
         unexplained=tuple(
             Unexplained(
                 side, j, variables, float(extended_rms[side][j - 1]), float(evidence.floor[side][j - 1])

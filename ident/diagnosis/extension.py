@@ -53,14 +53,14 @@ def extension(
             return members, with_members(members)
         acting = [m for m in members if any(worse & set(rows) for rows in m.rows)] or members
         left = [[m for m in members if m is not out] for out in acting]
-        errors = [_power_left(baseline.held, with_members(rest)) for rest in left]
+        errors = [power_left(baseline.held, with_members(rest)) for rest in left]
         best = int(np.argmin(errors))
-        if errors[best] > _power_left(baseline.held, after):
+        if errors[best] > power_left(baseline.held, after):
             return members, with_members(members)
         members = left[best]
 
 
-def _power_left(before: HeldOut, after: HeldOut) -> float:
+def power_left(before: HeldOut, after: HeldOut) -> float:
     """Power of the error after over that before, mean of all rows of a side and joint."""
     was, now = before.where(after).rms(), after.where(before).rms()
     share = np.concatenate([(now[side] / np.maximum(was[side], 1e-12)) ** 2 for side in was])

@@ -3,7 +3,8 @@
 Without a healthy arm, and without a motion that repeats, the least squares of the evidence lean on the drawing of the
 arm, with equal trust in each body. `identify` chooses estimator, prior and tilt by what they predict, with physically
 consistent bodies. So it makes both models: the base model from the torques as measured, the extended one from the
-torques less those of the effects, which are added again.
+torques less those of the effects, which are added again. A leaning base and gains of the torque sensors are left to it:
+it weighs both against all other parameters.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ident.diagnosis.nominal import Nominal
 from ident.diagnosis.recording import RecordStretch
 from ident.diagnosis.task import Task
 from ident.dynamics.structure import Side
-from ident.effects import Column, effects_torque
+from ident.effects import SENSOR_GAIN, Column, effects_torque
 from ident.effects.motion import ArmMotion
 from ident.estimation.identify import AUTO, IdentificationSettings, Known, identify
 from ident.model import DynamicModel
@@ -30,6 +31,9 @@ from lwr_driver.session.spool import stored
 
 Entries = tuple[Mapping[str, Any], ...]
 
+# What `identify` looks for by itself, see `ident.estimation.choice`.
+_BY_IDENTIFY = ("base_tilt", SENSOR_GAIN.cause)
+
 
 def refitted(task: Task, nominal: Nominal, effects: Entries) -> tuple[DynamicModel, DynamicModel]:
     """Base model, and extended model with `effects`, by `identify`'s own choice of the estimator.
@@ -37,6 +41,7 @@ def refitted(task: Task, nominal: Nominal, effects: Entries) -> tuple[DynamicMod
     Raises DataError for sessions that `identify` refuses.
     """
     base = _identified(task, nominal, task.sessions)
+    effects = tuple(e for e in effects if e["cause"] not in _BY_IDENTIFY)
     if not effects:
         return base, base
     extended = _identified(task, nominal, _without(task, nominal, effects))

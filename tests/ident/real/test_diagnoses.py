@@ -24,8 +24,8 @@ from tests.ident.real.real_lwr4 import DATA, EVERY, chain, mounted, needs_record
 
 SURE = 0.8
 SPLITS = [
-    pytest.param((3,), 1, 2.5, id="3 -> 1"),
-    pytest.param((1, 2), 3, 3.2, id="1, 2 -> 3", marks=pytest.mark.long),
+    pytest.param((3,), 1, 2.3, id="3 -> 1"),
+    pytest.param((1, 2), 3, 2.8, id="1, 2 -> 3", marks=pytest.mark.long),
 ]
 
 
