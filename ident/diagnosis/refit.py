@@ -21,7 +21,7 @@ from ident.diagnosis.nominal import Nominal
 from ident.diagnosis.recording import RecordStretch
 from ident.diagnosis.task import Task
 from ident.dynamics.structure import Side
-from ident.effects import SENSOR_GAIN, Column, effects_torque
+from ident.effects import BASE_TILT, SENSOR_GAIN, Column, effects_torque
 from ident.effects.motion import ArmMotion
 from ident.estimation.identify import AUTO, IdentificationSettings, Known, identify
 from ident.model import DynamicModel
@@ -32,7 +32,7 @@ from lwr_driver.session.spool import stored
 Entries = tuple[Mapping[str, Any], ...]
 
 # What `identify` looks for by itself, see `ident.estimation.choice`.
-_BY_IDENTIFY = ("base_tilt", SENSOR_GAIN.cause)
+_BY_IDENTIFY = (BASE_TILT.cause, SENSOR_GAIN.cause)
 
 
 def refitted(task: Task, nominal: Nominal, effects: Entries) -> tuple[DynamicModel, DynamicModel]:

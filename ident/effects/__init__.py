@@ -32,6 +32,7 @@ from ident.effects.motion import ArmMotion, Floats
 from ident.effects.words import Values, quantity, spoken
 
 __all__ = [
+    "BASE_TILT",
     "DELAYS",
     "EFFECTS",
     "ELASTICITY",
@@ -67,6 +68,7 @@ _ENTRY = frozenset({"cause", "side", "joints", "form", "parameters"})
 FRICTION_TEMPERATURE = drive.FrictionTemperature()
 PRESLIDING = drive.PreslidingHysteresis()
 ELASTICITY = link.JointElasticity()
+BASE_TILT = link.BaseTilt()
 SENSOR_GAIN = channel.SensorGain()
 ZERO_OFFSET = link.JointZeroOffset()
 LOST_SAMPLES = channel.LostSamples()
@@ -88,7 +90,7 @@ EFFECTS: dict[str, Effect] = {
         link.Backlash(),
         ELASTICITY,
         link.CableSpring(),
-        link.BaseTilt(),
+        BASE_TILT,
         load.PayloadError(),
         load.PayloadChange(),
         ZERO_OFFSET,
