@@ -50,6 +50,8 @@ METHOD = {
 
 _BIN = 20
 _BEGIN = 500
+# Cycles from one look for an unstable arm to the next.
+_CHECKED = 100
 _POSES = 100
 _PATH_HZ, _TWIST_HZ = 20.0, 12.0
 # Measured positions in use before and after a simulated part.
@@ -214,13 +216,14 @@ def replay(
         )
     bench = _Bench(model, chosen, stiffness, encoder, number, (start - chosen.start) * 1e-9, inertia)
     path = _smooth(joint.log_time, joint.position, grid)
-    _, motor, link = bench.run(path, _LED_HZ)
+    led = bench.led(path)
+    _, motor, link = bench.run(led, _LED_HZ)
     used, times = slice(_BEGIN, None), grid[_BEGIN:]
     position_error = motor_error = joint_error = None
     if chosen.motor is not None and chosen.motor.effort.shape[1] and "motor" in model.structure.sides:
         driven = _resampled(chosen.motor.log_time, chosen.motor.effort, grid)
         motor_error = _binned(np.where(_sticking(path), np.nan, driven - motor)[used])
-        position, _, _ = bench.run(path, _HELD_HZ, driven)
+        position, _, _ = bench.run(led, _HELD_HZ, driven)
         position_error = _binned((_resampled(joint.log_time, joint.position, grid) - position)[used])
     if joint.effort.shape[1] and "joint" in model.structure.sides:
         joint_error = _binned(_resampled(joint.log_time, joint.effort, times) - link[used])
@@ -230,6 +233,22 @@ def replay(
     return Replayed(
         *errors, bench.inertia, bench.exact, stiffness is None, len(times) * CYCLE_S, measured, begin_s
     )
+
+
+@dataclass(frozen=True)
+class _Led:
+    """Motion of the motors and the torque for it.
+
+    start, start_rate : (n,) of the links [rad, rad/s]. rigid : (N, n) torque of links and rotors [Nm].
+    target, target_rate : (N, n) of the motors [rad, rad/s]. way : (N, n) sign of the rate, less near standstill.
+    """
+
+    start: Floats
+    start_rate: Floats
+    rigid: Floats
+    target: Floats
+    target_rate: Floats
+    way: Floats
 
 
 class _Bench:
@@ -276,24 +295,29 @@ class _Bench:
         self.drive = replace(drive, stiffness=hard, damping=2.0 * _DAMPING * np.sqrt(hard * mass))
         self.inertia = mass + drive.Ia if inertia is None else inertia
 
-    def run(self, path: Floats, hertz: float, torque: Floats | None = None) -> tuple[Floats, Floats, Floats]:
-        """Noiseless position, motor and joint torque (N, n) along `path` (N, n), as published and reported.
-
-        hertz : of spring and damper. torque : (N, n) of the motors, as measured; None: that of the model on the path.
-        """
+    def led(self, path: Floats) -> _Led:
+        """What leads the arm along `path` (N, n), of the links."""
         rate = np.gradient(path, CYCLE_S, axis=0)
         rigid, target = self._rigid(path, rate)
         # In the middle of each cycle.
         target_rate = np.diff(target, axis=0, append=2.0 * target[-1:] - target[-2:-1]) / CYCLE_S
+        return _Led(path[0], rate[0], rigid, target, target_rate, np.clip(target_rate / _SLOW, -1.0, 1.0))
+
+    def run(self, led: _Led, hertz: float, torque: Floats | None = None) -> tuple[Floats, Floats, Floats]:
+        """Noiseless position, motor and joint torque (N, n) along a path, as published and reported.
+
+        hertz : of spring and damper. torque : (N, n) of the motors, as measured; None: that of the model on the path.
+        """
         effects = model_effects(self.model, session=self.number, begin_s=self.begin_s)
         pull, damper = self.inertia * (2.0 * np.pi * hertz) ** 2, _Damper(4.0 * np.pi * hertz * self.inertia)
         plant = ElasticArm(self.links, self.drive, effects=[*effects, damper])
-        plant.reset(path[0])
-        plant.velocity[:] = plant.motor_velocity[:] = rate[0]
+        plant.reset(led.start)
+        plant.velocity[:] = plant.motor_velocity[:] = led.start_rate
         answering = [effect for effect in effects if torque is None or not _late(effect)]
-        n = path.shape[1]
-        reading, out, own = Reading(*np.zeros((4, n))), np.zeros((3, len(path), n)), np.zeros(n)
-        for k in range(len(path)):
+        count, n = led.target.shape
+        reading, out, own = Reading(*np.zeros((4, n))), np.zeros((3, count, n)), np.zeros(n)
+        drag = damper.drag * led.target_rate
+        for k in range(count):
             time_s = k * CYCLE_S
             published = plant.motor_position if self.at_motor else plant.position
             reading.position[:], reading.motor_position[:] = published, plant.motor_position
@@ -303,17 +327,18 @@ class _Bench:
             for effect in answering:
                 effect.sense_motor(time_s, plant, reading)
             out[0, k], out[1, k], out[2, k] = reading.position, reading.motor_torque, reading.joint_torque
-            away = target[k] - plant.motor_position - (reading.position - published)
+            away = led.target[k] - plant.motor_position - (reading.position - published)
             if torque is None:
-                given = rigid[k] + damper.resistance(plant, target_rate[k])
+                given = led.rigid[k] + damper.resistance(plant, led.target_rate[k], led.way[k])
             else:
                 # The arm gets the torques as they were before the errors of their measurement.
                 given = torque[k] - (reading.motor_torque - own)
             before = plant.motor_velocity.copy()
-            applied = given + pull * away + damper.drag * target_rate[k]
+            applied = given + pull * away + drag[k]
             plant.step(applied)
             own = applied - 0.5 * damper.drag * (before + plant.motor_velocity)
-            if not np.all(np.isfinite(plant.position)):
+            # What is not finite stays so.
+            if (k % _CHECKED == 0 or k == count - 1) and not np.all(np.isfinite(plant.position)):
                 raise DataError("the simulated arm became unstable; the parameters are physically impossible")
         return out[0], out[1], out[2]
 
@@ -340,9 +365,12 @@ class _Damper(PlantEffect):
         """Adds the drag to the friction of the drives."""
         loads.Fvm += self.drag
 
-    def resistance(self, plant: ElasticArm, rate: Floats) -> Floats:
-        """Torque (n,) against friction and effects at the motors' speed (n,), with those of the last cycle."""
-        loads, way = plant.loads, np.clip(rate / _SLOW, -1.0, 1.0)
+    def resistance(self, plant: ElasticArm, rate: Floats, way: Floats) -> Floats:
+        """Torque (n,) against friction and effects, with those of the last cycle.
+
+        rate : (n,) speed of the motors [rad/s]. way : (n,) its sign, less near standstill.
+        """
+        loads = plant.loads
         viscous = plant.drive.Fvm + loads.Fvl if plant.cycles == 0 else loads.Fvm - self.drag + loads.Fvl
         coulomb, offset = loads.Fcm + loads.Fcl, loads.offm + loads.offl
         return np.asarray(viscous * rate + coulomb * way + offset - loads.motor_torque - loads.link_torque)

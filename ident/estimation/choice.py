@@ -36,6 +36,7 @@ from ident.estimation.identify import (
     Known,
     estimator_factory,
     identify,
+    observed,
 )
 from ident.estimation.mounting import Mounting, find_mounting, tilt_columns, with_tilt
 from ident.estimation.parts import beside, held_back_parts
@@ -46,6 +47,7 @@ from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior
 from ident.estimators.prior import Disagreement, MaximumAPosteriori, Prior
 from ident.estimators.problem import Problem
 from ident.rows.filters import half_width
+from ident.rows.sessions import require
 from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -200,7 +202,9 @@ def choose(
     sessions = as_sessions(sessions)
     prior = chain.urdf is not None and settings.model != 3
     plain = replace(settings, estimator="map" if prior else "wls", essential=None)
-    first = identify(sessions, chain, plain, known=known)
+    require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
+    rows = observed(sessions, chain, plain, known=known)
+    first = rows.identified(rows.settings)
     choice = compared(first, sessions, tilt=tilt)
     winner = choice.winner
     options: dict[str, Any] = {"prior_strength": winner.prior_scale} if winner.estimator == "physical" else {}
@@ -210,8 +214,10 @@ def choose(
     if winner.tilt:
         mounting = find_mounting(sessions, chain, final, known=first.known)
         found, choice = mounting.identification, replace(choice, mounting=mounting)
-    else:
+    elif choice.gains:
         found = identify(sessions, chain, final, known=first.known)
+    else:
+        found = rows.identified(final)
     effects = tuple(
         entry_of(SENSOR_GAIN, [chain.joint_names.index(joint) + 1], {"error": gain})
         for joint, gain in choice.gains.items()

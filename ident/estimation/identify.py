@@ -272,6 +272,82 @@ class Identification(Tabular):
         return lines
 
 
+@dataclass(frozen=True)
+class Observed:
+    """The rows of the sessions of an arm, for any number of estimators.
+
+    settings : with the figures that the data chose. problem : the stacked regression. instruments : the rows of the
+    commanded motion, empty where a session has none. sessions : with the chain's joints. Others: see `Identification`.
+    """
+
+    settings: IdentificationSettings
+    structure: ModelStructure
+    base: BaseSet
+    problem: Problem
+    instruments: tuple[Problem, ...]
+    prepared: tuple[PreparedSession, ...]
+    payloads: tuple[str | None, ...]
+    sessions: tuple[Session, ...]
+    known: Known
+
+    @cached_property
+    def full_rank(self) -> bool:
+        """Whether the motion shows all parameters."""
+        return bool(np.isfinite(self.problem.normalised_condition))
+
+    @cached_property
+    def instrumental(self) -> Estimate | None:
+        """Estimate by the commanded motion as instruments; None without one or without full rank."""
+        if not self.instruments or not self.full_rank:
+            return None
+        matrices = [group.matrix for one in self.instruments for group in one.groups]
+        return InstrumentalVariables(lambda values: matrices, self.settings.covariance).fit(self.problem)
+
+    def identified(self, settings: IdentificationSettings) -> Identification:
+        """The estimate by `settings`, which differ from those of the rows in estimator and essential search alone."""
+        problem, base = self.problem, self.base
+        name = settings.estimator
+        factory = estimator_factory(name) if isinstance(name, str) else name
+        estimator = factory(base, problem, settings.covariance)
+        if getattr(estimator, "needs_rank", True):
+            problem.require_rank()
+        # With instrumental variables, this is the WLS compared with them.
+        estimate = plain = estimator.fit(problem)
+        if name == "iv":
+            if self.instrumental is None:
+                raise DataError(
+                    "estimator `iv` takes its instruments from the commanded motion, missing in a session: record "
+                    "/joint_command and do not average periods, or choose `wls`"
+                )
+            estimate = self.instrumental
+        assumptions = check_assumptions(
+            problem, plain, instrumental=self.instrumental, period_rows=_common_period(self.prepared)
+        )
+        essential = None
+        if settings.essential is not None and self.full_rank:
+            essential = find_essential(problem, estimate, settings.essential, settings.covariance)
+        warnings = [*self.known.doubts, *(text for session in self.prepared for text in session.warnings)]
+        warnings += require_plausible(problem, estimate, self.structure.chain.joint_names)
+        warnings += payload_warnings(self.sessions, self.payloads, base, estimate, self.structure)
+        warnings += _excitation_warnings(problem, estimate, self.full_rank)
+        return Identification(
+            settings=settings,
+            structure=self.structure,
+            base=base,
+            problem=problem,
+            estimate=estimate,
+            prepared=self.prepared,
+            payloads=self.payloads,
+            condition=problem.condition,
+            condition_normalised=problem.normalised_condition,
+            assumptions=assumptions,
+            essential=essential,
+            robot=settings.robot or self.sessions[0].metadata.get("robot", "") or "arm",
+            warnings=tuple(warnings),
+            known=self.known,
+        )
+
+
 def identify(
     sessions: Sessions,
     chain: Chain,
@@ -295,6 +371,14 @@ def identify(
         from ident.estimation.choice import choose
 
         return choose(sessions, chain, settings, known=known)
+    rows = observed(sessions, chain, settings, known=known)
+    return rows.identified(rows.settings)
+
+
+def observed(
+    sessions: Sessions, chain: Chain, settings: IdentificationSettings, *, known: Known | None = None
+) -> Observed:
+    """The rows of the sessions for any estimator; arguments and errors as for `identify`."""
     sessions = as_sessions(sessions)
     if not sessions:
         raise DataError("no session given; name at least one session file")
@@ -366,51 +450,16 @@ def identify(
             seen = observe([motion], [payload], rows_structure, columns=base.columns)
             instruments.append(without_dead(seen, session))
             del motion
-    warnings = [*known.doubts, *(warning for session in prepared for warning in session.warnings)]
     _every_joint_moves(prepared, chain)
-    problem = stack(problems)
-    # With instrumental variables, this is the WLS compared with them.
-    name = settings.estimator
-    factory = estimator_factory(name) if isinstance(name, str) else name
-    estimator = factory(base, problem, settings.covariance)
-    needs_rank = getattr(estimator, "needs_rank", True)
-    normalised = problem.require_rank() if needs_rank else problem.normalised_condition
-    full_rank = bool(np.isfinite(normalised))
-    instrumental = None
-    if len(instruments) == len(problems) and full_rank:
-        matrices = [group.matrix for one in instruments for group in one.groups]
-        instrumental = InstrumentalVariables(lambda values: matrices, settings.covariance).fit(problem)
-    estimate = plain = estimator.fit(problem)
-    if settings.estimator == "iv":
-        if instrumental is None:
-            raise DataError(
-                "estimator `iv` takes its instruments from the commanded motion, missing in a session: record "
-                "/joint_command and do not average periods, or choose `wls`"
-            )
-        estimate = instrumental
-    assumptions = check_assumptions(
-        problem, plain, instrumental=instrumental, period_rows=_common_period(prepared)
-    )
-    essential = None
-    if settings.essential is not None and full_rank:
-        essential = find_essential(problem, estimate, settings.essential, settings.covariance)
-    warnings += require_plausible(problem, estimate, chain.joint_names)
-    warnings += payload_warnings(chosen, payloads, base, estimate, structure)
-    warnings += _excitation_warnings(problem, estimate, full_rank)
-    return Identification(
+    return Observed(
         settings=settings,
         structure=structure,
         base=base,
-        problem=problem,
-        estimate=estimate,
+        problem=stack(problems),
+        instruments=tuple(instruments) if len(instruments) == len(problems) else (),
         prepared=tuple(prepared),
         payloads=tuple(payloads),
-        condition=problem.condition,
-        condition_normalised=normalised,
-        assumptions=assumptions,
-        essential=essential,
-        robot=settings.robot or chosen[0].metadata.get("robot", "") or "arm",
-        warnings=tuple(warnings),
+        sessions=tuple(chosen),
         known=known,
     )
 
