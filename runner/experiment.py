@@ -296,7 +296,7 @@ class Run:
                 if not np.array_equal(motion.q[0], driver.state().q_command):
                     # The controller moved its set point at the start of command mode.
                     motion, preflight = self._prepare(plan, here)
-                uids = self._progress.begin(plan.name, path, f"{self.experiment.uid}-{plan.name}")
+                uids = self._progress.begin(plan.name, path, self.experiment.session_uid(plan.name))
                 driver.record(
                     path,
                     bench.metadata(self.experiment, plan.payload, *uids),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -302,8 +303,17 @@ class Experiment:
 
     @property
     def uid(self) -> str:
-        """Hash of the file, twelve hexadecimal digits."""
-        return hashlib.sha256(self.text.encode()).hexdigest()[:12]
+        """Hash of the file and of the emulator's settings in force, twelve hexadecimal digits."""
+        settings = repr(sorted(self.emulator_settings.items()))
+        return hashlib.sha256(f"{self.text}{settings}".encode()).hexdigest()[:12]
+
+    def session_uid(self, name: str) -> str:
+        """Uid of the session `name` begun now.
+
+        The clock tells recordings by one file apart; those of the emulator in lock step differ by their settings alone.
+        """
+        begun = "" if self.lock_step else f"-{datetime.now(UTC):%Y%m%dT%H%M%S%f}"
+        return f"{self.uid}-{name}{begun}"
 
     def home(self, joints: int) -> npt.NDArray[np.float64]:
         """Resting position of the arm [rad], shape (joints,)."""

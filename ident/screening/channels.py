@@ -94,15 +94,20 @@ def _torques(session: Session) -> Iterator[tuple[str, JointColumns]]:
 
 def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
     for a, b in combinations(sessions, 2):
-        one, two = a.metadata.get("uid", ""), b.metadata.get("uid", "")
         share = _shared_rows(a, b)
-        if (one and one == two) or share > _SAME_ROWS:
-            seen = f"{a.path.name} and {b.path.name} hold the same samples ({100 * share:.0f} %)"
-            if one and one == two:
-                seen += f" and the uid {one}"
+        uid = a.metadata.get("uid", "")
+        alike = f" and the uid {uid}" if uid and uid == b.metadata.get("uid", "") else ""
+        names = f"{a.path.name} and {b.path.name}"
+        if share > _SAME_ROWS:
+            seen = f"{names} hold the same samples ({100 * share:.0f} %){alike}"
             yield Doubt(
                 "log", (), seen, "one log given twice", "give each log once; a copy is no new data", True
             )
+        elif alike:
+            # Two recordings by one experiment file had one uid once.
+            seen = f"{names} hold different samples{alike}"
+            advice = "leave one out if it was made from the other; two recordings may stay"
+            yield Doubt("log", (), seen, "one log processed into another", advice, False)
 
 
 def _shared_rows(a: Session, b: Session) -> float:

@@ -104,7 +104,10 @@ def _head(path: Path, root: Path) -> tuple[Log, str, date]:
     dated = (
         (root.resolve().name, *path.relative_to(root).parts) if path != root else path.resolve().parts[-3:]
     )
-    return Log(path, metadata.get("uid") or _hash(path)), arm, _day(dated, metadata, int(first.log_time[0]))
+    begun = int(first.log_time[0])
+    # Two recordings by one experiment file may have one uid.
+    uid = f"{metadata['uid']}-{begun}" if metadata.get("uid") else _hash(path)
+    return Log(path, uid), arm, _day(dated, metadata, begun)
 
 
 def _day(dated: Sequence[str], metadata: dict[str, str], first_ns: int) -> date:

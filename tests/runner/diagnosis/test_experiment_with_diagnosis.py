@@ -275,20 +275,28 @@ def test_decide_runs_the_motions_and_names_the_hidden_cause(
 
 
 @pytest.mark.long
-def test_a_doubt_that_comes_by_itself_is_settled_by_the_slow_sweep(tmp_path: Path) -> None:
-    """The Stribeck effect and friction that bends with speed look alike in one short session."""
-    parameters = {"amplitude": 0.6, "velocity": 0.08, "exponent": 1.0}
+def test_with_a_healthy_arm_its_character_becomes_a_finding(tmp_path: Path) -> None:
+    parameters = {"amplitude": 1.0, "velocity": 0.08, "exponent": 1.0}
     options = {"cause": "stribeck", "joint": 4, "parameters": parameters}
     hidden = {"type": "sim_backend.model_arm:Cause", "options": options}
-    out = tmp_path / "out"
-    file = experiment_file(tmp_path, [hidden], diagnosis={"sure": 0.9})
-    lwr_run("experiment", str(file), "--yes", "--decide", "--out", str(out))
-    before = json.loads((out / "diagnosis" / "before_deciding.json").read_text())["findings"][0]
-    assert before["confidence"] < 0.9
-    assert {before["cause"], before["alternatives"][0]["cause"]} == {"stribeck", "viscous_nonlinear"}
-    (answer,) = json.loads((out / "diagnosis" / "decision.json").read_text())["answers"]
-    assert answer["outcome"] == "decided"
-    assert answer["named"] == {"cause": "stribeck", "joints": [4]}
+    sets = record_sets(Experiment.load(experiment_file(tmp_path, [])), tmp_path / "sets", 3, assume_yes=True)
+    healthy = tmp_path / "healthy.yaml"
+    lwr_run(
+        "commission", *(str(path) for part in sets for path in part), "--sets", "3", "--out", str(healthy)
+    )
+
+    def told(name: str, diagnosis: dict[str, Any]) -> dict[str, list[tuple[str, list[int]]]]:
+        out = tmp_path / name
+        file = experiment_file(tmp_path, [hidden], diagnosis=diagnosis)
+        lwr_run("experiment", str(file), "--yes", "--decide", "--out", str(out))
+        found = json.loads((out / "diagnosis" / "diagnosis.json").read_text())
+        assert not (out / "diagnosis" / "decision.json").exists()
+        return {
+            kind: [(one["cause"], one["joints"]) for one in found[kind]] for kind in ("findings", "character")
+        }
+
+    assert told("alone", {}) == {"findings": [], "character": [("stribeck", [4])]}
+    assert told("compared", {"reference": str(healthy)}) == {"findings": [("stribeck", [4])], "character": []}
 
 
 @pytest.mark.long

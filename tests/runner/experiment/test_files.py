@@ -115,6 +115,15 @@ def test_a_folder_belongs_to_one_process_until_its_end(tmp_path: Path) -> None:
             pass
 
 
+def test_recordings_by_one_file_have_uids_of_their_own() -> None:
+    experiment = Experiment("short")
+    assert experiment.session_uid("unloaded") == experiment.session_uid("unloaded")
+    seeded = experiment.changed(emulator_settings={"seed": 7})
+    clocked = experiment.changed(lock_step=False)
+    others = [seeded, clocked, clocked]
+    assert len({one.session_uid("unloaded") for one in (experiment, *others)}) == 4
+
+
 @pytest.mark.parametrize("change", ["none", "empty", "cut", "other", "short"])
 def test_finished_logs_are_whole_and_of_this_experiment(tmp_path: Path, change: str) -> None:
     experiment = Experiment("short")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ from playwright.sync_api import Browser
 
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import read_model
+from lwr_driver.session import SessionWriter, session_metadata
 from runner.cli import main
 from runner.fleet import FleetStore, fleet_trend
+from runner.fleet.days import find_days
 from tests.fleet import Event, Fleet
 from tests.ident.known_arm import truth_model  # noqa: F401  fixture
 from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, flaws, opened
@@ -75,6 +78,21 @@ def test_a_further_day_is_the_only_work_and_copies_are_known(fleet: Fleet, store
     after = {arm.name: arm.days() for arm in store.arms()}
     assert after["LWR4+_arm_00"] == (*before["LWR4+_arm_00"], "2026-03-09")
     assert json.loads(batch(fleet, "--json").stdout)["done"] == []
+
+
+def test_recordings_with_one_uid_are_no_copies(tmp_path: Path) -> None:
+    for day in (1, 2):
+        place = tmp_path / f"2026-03-0{day}"
+        place.mkdir()
+        stamps = np.arange(100) * 2_000_000 + day * 10**15
+        metadata = session_metadata(robot="LWR4+", uid="one")
+        with SessionWriter(place / "unloaded.mcap", ("A1",), metadata, start_ns=int(stamps[0])) as writer:
+            writer.write_joint_states(stamps, np.zeros((100, 1)), np.zeros((100, 1)), publish_time=stamps)
+    (tmp_path / "copy").mkdir()
+    shutil.copy(tmp_path / "2026-03-01" / "unloaded.mcap", tmp_path / "copy")
+    found = find_days([tmp_path])
+    assert [day.day.isoformat() for day in found.days] == ["2026-03-01", "2026-03-02"]
+    assert [path.parent.name for path in found.repeated] == ["copy"]
 
 
 def test_the_model_of_all_days_comes_from_the_factors_alone(fleet: Fleet, store: FleetStore) -> None:
