@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -31,6 +31,8 @@ from lwr_driver.places import Place
 from lwr_driver.yaml_text import yaml_content
 
 _SCHEMA = 1
+# Searches that end this close to the best one have found the same value.
+_SAME = 0.01
 _CYCLE_TOLERANCE = 1e-6
 
 _Duration = Annotated[float, within(0.01, LONGEST_EXCITATION_S, "s")]
@@ -277,8 +279,22 @@ def _margin_from_mapping(entry: Any) -> Margin:
     return Margin(*names, value, limit, slack, str(entry["unit"]), time_s, bool(entry.get("proven", True)))
 
 
+def spread_text(values: Sequence[float]) -> str:
+    """How near several independent searches came to the best of them, as a measure of what more could find.
+
+    values : best value of each search, in reported units.
+    """
+    best, middle, last = (f"{v:.4g}" for v in (min(values), float(np.median(values)), max(values)))
+    near = sum(value <= (1.0 + _SAME) * min(values) for value in values)
+    advice = "" if near > 1 else ": no other confirms the best one, more may find a better motion"
+    return (
+        f"{len(values)} independent searches: best {best}, median {middle}, worst {last}; {near} within "
+        f"{100 * _SAME:.0f} % of the best{advice}"
+    )
+
+
 def plan_pieces(plan: ExcitationPlan) -> list[Piece]:
-    """Tables of a plan: criteria, tightest margins, largest predicted deviations."""
+    """Tables of a plan: criteria, tightest margins, largest predicted deviations; the spread of several searches."""
     found: list[Piece] = [
         Listing(("criterion", "value"), [(name, f"{v:.4f}") for name, v in plan.objectives.items()]),
         "",
@@ -302,4 +318,5 @@ def plan_pieces(plan: ExcitationPlan) -> list[Piece]:
     if worst:
         rows = [(name, f"{value:.2f}") for name, value in worst]
         found += ["", Listing(("largest predicted deviations", "RSD %"), rows)]
-    return found
+    searches = plan.provenance.get("searches", ())
+    return [*found, "", spread_text(searches)] if len(searches) > 1 else found

@@ -11,7 +11,7 @@ import json
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,7 @@ from ident.excitation.clearance import space_of
 from ident.excitation.information import Columns, ConstantBasis
 from ident.excitation.motions import Array, FourierBasis, ParametricMotion
 from ident.excitation.plan import ExcitationPlan
-from ident.excitation.problem import PlanProblem
+from ident.excitation.problem import PlanProblem, Search
 from ident.excitation.program import Row, Setup
 from ident.excitation.search import (
     Candidate,
@@ -53,6 +53,8 @@ _STARTS = 12
 _ROUNDS = 4
 _RESERVE = 3e-3
 _NEAR = 5e-3
+# Candidates polished at most, until one passes every check.
+_TRIES = 6
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,8 @@ def plan(
     problem, interrupted = _with_goal(problem, progress)
     assembled = assemble(problem)
     refuse_impossible(assembled)
-    tracker = _Tracker(assembled, progress, interrupted)
-    candidates = search_candidates(assembled, tracker)
+    tracker = _Tracker(assembled.setup, problem.search, progress, interrupted)
+    candidates = search_candidates(assembled.setup, problem.search, tracker)
     tracker.stage("polish", 1)
     outcome = _first_that_passes(assembled, candidates, tracker.interrupted)
     result = _describe(assembled, outcome, tracker)
@@ -110,8 +112,8 @@ def _with_goal(problem: PlanProblem, progress: Callable[[Progress], None] | None
     alone = replace(problem, objective=replace(objective, criterion="condition_number"))
     assembled = assemble(alone)
     refuse_impossible(assembled)
-    tracker = _Tracker(assembled, progress)
-    best = search_candidates(assembled, tracker)[0]
+    tracker = _Tracker(assembled.setup, alone.search, progress)
+    best = search_candidates(assembled.setup, alone.search, tracker)[0]
     if not best.feasible:
         raise RefusedError(explain(assembled, [polish(assembled, best, quick=True)]))
     goal = float(np.exp(best.value))
@@ -123,11 +125,18 @@ class _Tracker:
     """Counts tasks, keeps the best value, reports to the listener, and checks the time limit."""
 
     def __init__(
-        self, assembled: Assembled, listener: Callable[[Progress], None] | None, interrupted: bool = False
+        self,
+        setup: Setup,
+        search: Search,
+        listener: Callable[[Progress], None] | None,
+        interrupted: bool = False,
     ) -> None:
-        self.assembled, self.listener, self.interrupted = assembled, listener, interrupted
+        self.target, self.search = setup.target, search
+        self.listener, self.interrupted = listener, interrupted
         self.begun = time.monotonic()
         self.evaluations = 0
+        # Best value of each independent search, in reported units, infinite without a feasible motion.
+        self.values: list[float] = []
         self.best: Candidate | None = None
         self.name, self.done, self.total = "", 0, 0
 
@@ -148,47 +157,31 @@ class _Tracker:
     @property
     def out_of_time(self) -> bool:
         """True after the time limit of the search or an interruption."""
-        limit = self.assembled.problem.search.time_limit_s
+        limit = self.search.time_limit_s
         return self.interrupted or (limit is not None and time.monotonic() - self.begun > limit)
+
+    def reported(self, candidate: Candidate) -> float | None:
+        """Value of a candidate in reported units, None for an infeasible one."""
+        return self.target.report(candidate.value) if candidate.feasible and self.target is not None else None
 
     def _report(self) -> None:
         if self.listener is None:
             return
         best = self.best
         feasible = best is not None and best.feasible
-        target = self.assembled.setup.target
-        value = target.report(best.value) if best is not None and feasible and target is not None else None
+        value = None if best is None else self.reported(best)
         elapsed = time.monotonic() - self.begun
         self.listener(Progress(self.name, self.done, self.total, value, feasible, elapsed))
 
 
-def search_candidates(assembled: Assembled, tracker: _Tracker) -> list[Candidate]:
-    """Starts, then hops with successive halving of the lanes; best first. Ends early on Ctrl-C or out of time."""
-    search, setup = assembled.problem.search, assembled.setup
+def search_candidates(setup: Setup, search: Search, tracker: _Tracker) -> list[Candidate]:
+    """Candidates of one search or of several independent ones, best first. Ends early on Ctrl-C or out of time."""
     found: list[Candidate] = []
     try:
-        tracker.stage("starts", search.starts)
-        tasks = [delayed(begin)(setup, (search.seed, index)) for index in range(search.starts)]
-        found += _run(tasks, search.jobs, tracker)
-        lanes = _ranked(found)[: search.lanes]
-        left, round_ = search.hops, 0
-        tracker.stage("hops", search.hops)
-        stages = max(1, int(np.ceil(np.log2(max(len(lanes), 1)))) + 1)
-        share = search.hops / stages
-        while left > 0 and lanes and not tracker.out_of_time:
-            batch = [lane for lane in range(len(lanes)) if left - lane * _HOPS_PER_TASK > 0]
-            sizes = [min(_HOPS_PER_TASK, left - lane * _HOPS_PER_TASK) for lane in batch]
-            tasks = [
-                delayed(hop)(setup, lanes[lane], (search.seed, 1000 + round_, lane), size)
-                for lane, size in zip(batch, sizes, strict=True)
-            ]
-            for lane, improved in zip(batch, _run(tasks, search.jobs, tracker, sizes), strict=False):
-                lanes[lane] = improved
-            found += lanes
-            left -= sum(sizes)
-            round_ += 1
-            stage = int((search.hops - left) / share + 1e-9)
-            lanes = _ranked(lanes)[: max(1, search.lanes >> min(stage, 30))]
+        for candidates in (
+            _single(setup, search, tracker) if search.searches == 1 else _several(setup, search, tracker)
+        ):
+            found += candidates
     except KeyboardInterrupt:
         kept = "no motion was found yet" if tracker.best is None else "the best motion so far is kept"
         _log.warning("search interrupted; %s", kept)
@@ -198,6 +191,54 @@ def search_candidates(assembled: Assembled, tracker: _Tracker) -> list[Candidate
     if not found:
         raise OperatorError("planning was interrupted before any motion was found; start it again")
     return _ranked(found)
+
+
+def _single(setup: Setup, search: Search, tracker: _Tracker) -> Iterator[list[Candidate]]:
+    """Starts, then hops with successive halving of the lanes; the candidates of each round."""
+    tracker.stage("starts", search.starts)
+    tasks = [delayed(begin)(setup, (search.seed, index)) for index in range(search.starts)]
+    found = _run(tasks, search.jobs, tracker)
+    yield found
+    lanes = _ranked(found)[: search.lanes]
+    left, round_ = search.hops, 0
+    tracker.stage("hops", search.hops)
+    stages = max(1, int(np.ceil(np.log2(max(len(lanes), 1)))) + 1)
+    share = search.hops / stages
+    while left > 0 and lanes and not tracker.out_of_time:
+        batch = [lane for lane in range(len(lanes)) if left - lane * _HOPS_PER_TASK > 0]
+        sizes = [min(_HOPS_PER_TASK, left - lane * _HOPS_PER_TASK) for lane in batch]
+        tasks = [
+            delayed(hop)(setup, lanes[lane], (search.seed, 1000 + round_, lane), size)
+            for lane, size in zip(batch, sizes, strict=True)
+        ]
+        for lane, improved in zip(batch, _run(tasks, search.jobs, tracker, sizes), strict=False):
+            lanes[lane] = improved
+        yield list(lanes)
+        left -= sum(sizes)
+        round_ += 1
+        stage = int((search.hops - left) / share + 1e-9)
+        lanes = _ranked(lanes)[: max(1, search.lanes >> min(stage, 30))]
+
+
+def _several(setup: Setup, search: Search, tracker: _Tracker) -> Iterator[list[Candidate]]:
+    """Independent searches, one a task: none waits for another. Search k is that of seed `seed` + k by itself."""
+    tracker.stage("searches", search.searches)
+    tasks = [
+        delayed(one_search)(setup, replace(search, seed=search.seed + k, searches=1, jobs=1))
+        for k in range(search.searches)
+    ]
+    for candidates, evaluations in Parallel(n_jobs=search.jobs, return_as="generator")(tasks):
+        value = tracker.reported(candidates[0])
+        tracker.values.append(np.inf if value is None else value)
+        tracker.evaluations += evaluations
+        tracker.advance(replace(candidates[0], evaluations=0))
+        yield candidates
+
+
+def one_search(setup: Setup, search: Search) -> tuple[list[Candidate], int]:
+    """The best candidates of a search, and its evaluations: a task for one process."""
+    tracker = _Tracker(setup, search, None)
+    return search_candidates(setup, search, tracker)[:_TRIES], tracker.evaluations
 
 
 def _run(
@@ -222,7 +263,7 @@ def _ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _first_that_passes(assembled: Assembled, candidates: Sequence[Candidate], interrupted: bool) -> Outcome:
-    tries = 3 if interrupted else 6
+    tries = 3 if interrupted else _TRIES
     failures = []
     for candidate in candidates[:tries]:
         outcome = polish(assembled, candidate, quick=interrupted)
@@ -242,6 +283,7 @@ def _describe(assembled: Assembled, outcome: Outcome, tracker: _Tracker) -> Exci
         "arm": assembled.arm_name,
         "evaluations": int(tracker.evaluations),
         "interrupted": bool(tracker.interrupted),
+        "searches": sorted(value for value in tracker.values if np.isfinite(value)),
         "versions": {
             name: importlib.metadata.version(name)
             for name in ("lwr-identification", "numpy", "scipy", "numba")

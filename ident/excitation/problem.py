@@ -108,6 +108,7 @@ class Search:
     """Extent of the search. Seed and counts alone decide the result; a time limit makes it depend on the computer.
 
     starts : random starts; hops : perturbations tried afterwards; lanes : candidates perturbed at first
+    searches : independent searches with seeds from `seed` on, the best of which counts; each is one task
     jobs : processes, through joblib with its configured backend (loky, dask, ray)
     """
 
@@ -115,6 +116,7 @@ class Search:
     starts: Annotated[int, within(1, 100)] = 8
     hops: Annotated[int, within(0, 5000)] = 120
     lanes: Annotated[int, within(1, 100)] = 4
+    searches: Annotated[int, within(1, 1000)] = 1
     jobs: Annotated[int, within(-1, 1024)] = 1
     time_limit_s: Annotated[float, within(0.1, 86400.0, "s")] | None = None
 

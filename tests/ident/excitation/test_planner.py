@@ -35,6 +35,7 @@ from ident.excitation import (
 from ident.excitation.arm_model import ArmEstimate, Mechanism, rigid_torque, torque_bounds
 from ident.excitation.comparison import random_points
 from ident.excitation.motions import Samples
+from ident.excitation.plan import spread_text
 from ident.excitation.search import judge, polish
 from ident.model import DynamicModel
 from ident.model.model_file import write_model
@@ -114,6 +115,34 @@ def test_the_search_runs_on_a_dask_cluster(problem: PlanProblem) -> None:
     ):
         spread = plan(small)
     np.testing.assert_array_equal(spread.sample(3.3).q, alone.sample(3.3).q)
+
+
+def test_independent_searches_are_those_of_their_seeds_and_the_best_one_counts(problem: PlanProblem) -> None:
+    few = Search(seed=3, starts=1, hops=0)
+    alone = [plan(replace(problem, search=replace(few, seed=seed))) for seed in (3, 4)]
+    heard: list[Progress] = []
+    together = [
+        plan(replace(problem, search=replace(few, searches=2, jobs=jobs)), heard.append) for jobs in (1, 2)
+    ]
+    best = min(alone, key=lambda one: one.objectives[CONDITION])
+    for found in together:
+        np.testing.assert_array_equal(found.sample(3.3).q, best.sample(3.3).q)
+        values = found.provenance["searches"]
+        assert values == sorted(values)
+        assert len(values) == 2
+        assert values[0] == pytest.approx(best.objectives[CONDITION], rel=0.05)
+        assert spread_text(values) in text_of(plan_pieces(found))
+    assert [event.stage for event in heard if event.done == 0] == 2 * ["searches", "polish"]
+    assert "independent" not in text_of(plan_pieces(best))
+
+
+def test_the_spread_of_searches_says_whether_another_confirms_the_best() -> None:
+    assert spread_text([25.0, 25.2, 27.0, 30.0]) == (
+        "4 independent searches: best 25, median 26.1, worst 30; 2 within 1 % of the best"
+    )
+    assert spread_text([25.0, 25.3]).endswith(
+        "1 within 1 % of the best: no other confirms the best one, more may find a better motion"
+    )
 
 
 def test_progress_counts_up_and_only_improves(problem: PlanProblem) -> None:
