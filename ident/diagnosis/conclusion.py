@@ -11,16 +11,16 @@ import numpy as np
 from fri.errors import DataError
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import believable
-from ident.diagnosis.confirmation import FELT_POWER, confirmed, doubted
+from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, doubted
 from ident.diagnosis.evidence import Floats
-from ident.diagnosis.extension import Member, extension, nameless_terms, power_left, title
+from ident.diagnosis.extension import Member, extension, nameless_terms, power_left, title, torque_error
 from ident.diagnosis.findings import loss_finding
-from ident.diagnosis.held_out import held_out
+from ident.diagnosis.held_out import HeldOut, held_out
 from ident.diagnosis.nominal import GAIN_STD, TRAVEL_RAD, Nominal
 from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.refit import left_by, refitted
-from ident.diagnosis.result import Diagnosis, Finding, RowStates, Unexplained
+from ident.diagnosis.result import Diagnosis, Finding, Nameless, RowStates, Unexplained
 from ident.diagnosis.selection import GAIN
 from ident.diagnosis.task import Baseline, State, Task
 from ident.diagnosis.wear import is_level, wear
@@ -69,26 +69,24 @@ def conclude(task: Task, state: State) -> Diagnosis:
         if r.terms
     ]
     members, after = extension(bench, baseline, members, nuisance, settings.seed)
+    by_identify = task.sound and evidence.drawn
+    refuted: list[Finding] = []
+    if not by_identify:
+        members, after, refuted = _predicting(task, state, baseline, members, after)
+    findings = [contradicted(f) if any(f is r for r in refuted) else f for f in findings]
+    findings = [f for f in findings if believable(f.grounds)]
     findings += [*state.timing, *worn]
     loss = sample_loss(list(task.sessions))
     if loss:
         findings.append(loss_finding(loss[0]))
     findings.sort(key=lambda f: -f.gain)
-    shipped = [m.finding for m in members if m.finding is not None]
-    nameless = nameless_terms(bench, members, nuisance, after, settings.seed)
+    base_model, extended, nameless = _models(task, state, baseline, members, after)
+    changes = _changes(base_model, extended) if extended.effects != base_model.effects else {}
     before, after = baseline.held.where(after), after.where(baseline.held)
     extended_rms = after.rms()
-    entries = [_entry(f) for f in findings if f in shipped or f in state.timing]
-    base_model, extended, changes = _models(
-        task,
-        bench,
-        baseline,
-        state.selection.nuisance,
-        (*entries, *(e for term in nameless for e in term.entries)),
-    )
     added = tuple(title(entry) for entry in extended.effects[len(base_model.effects) :])
     notes = state.notes
-    if task.sound and evidence.drawn:
+    if by_identify:
         try:
             base_model, extended = refitted(task, nominal, extended.effects[len(base_model.effects) :])
         except DataError as error:
@@ -96,7 +94,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
         else:
             if nominal.held_out:
                 before, after = (left_by(m, nominal, h) for m, h in ((base_model, before), (extended, after)))
-                if power_left(before, after) >= 1.0:
+                worse = power_left(before, after) >= 1.0
+                if worse or torque_error(extended, task.test) > torque_error(base_model, task.test):
                     extended, after = base_model, before
                 extended_rms = after.rms()
             own = {title(entry) for entry in base_model.effects}
@@ -149,17 +148,18 @@ def conclude(task: Task, state: State) -> Diagnosis:
 
 
 def _models(
-    task: Task,
-    bench: DiagnosisBench,
-    baseline: Baseline,
-    nuisance: Mapping[str, tuple[float, float]],
-    effects: tuple[Mapping[str, Any], ...],
-) -> tuple[DynamicModel, DynamicModel, dict[str, float]]:
-    """Base model, extended model with the columns of the evidence, and the change of the base parameters in their
-    standard deviations.
+    task: Task, state: State, baseline: Baseline, members: Sequence[Member], after: HeldOut
+) -> tuple[DynamicModel, DynamicModel, tuple[Nameless, ...]]:
+    """Base model, extended model with the members and the late channels, and the members without a name.
+
+    after : held-out rows with the members; the columns of the evidence are theirs.
     """
+    bench, nuisance = state.bench, state.selection.nuisance_rows
     evidence, nominal = bench.evidence, bench.nominal
     p = evidence.base_count
+    nameless = nameless_terms(bench, members, nuisance, after, task.settings.seed)
+    named = [m.finding for m in members if m.finding is not None]
+    effects = [*map(_entry, (*named, *state.timing)), *(e for term in nameless for e in term.entries)]
     robot = task.sessions[0].metadata.get("robot", "") or "arm"
     provenance: dict[str, Any] = {
         "sessions": [r.name for r in nominal.recordings if not r.test],
@@ -175,11 +175,39 @@ def _models(
         baseline.covariance,
         replace(nominal.base, structure=structure),
         provenance,
-        (*nominal.arm.healthy, *_gains(nuisance)),
+        (*nominal.arm.healthy, *_gains(state.selection.nuisance)),
     )
     values, covariance = evidence.full.values[:p].copy(), evidence.covariance()[:p, :p]
     extended = replace(base, values=values, covariance=covariance, effects=(*base.effects, *effects))
-    return base, extended, _changes(base, extended) if effects else {}
+    return base, extended, nameless
+
+
+def _predicting(
+    task: Task, state: State, baseline: Baseline, members: list[Member], after: HeldOut
+) -> tuple[list[Member], HeldOut, list[Finding]]:
+    """The members without those that raise the torque error of the held-out sessions, the rows with them, and the
+    findings that went.
+
+    The rows end at the parallel filter's band; the torque error has all samples, as users compute the torque.
+    """
+    evidence, nuisance = state.bench.evidence, state.selection.nuisance_rows
+    if not task.test or not members:
+        return members, after, []
+    refuted: list[Finding] = []
+    base, extended, _ = _models(task, state, baseline, members, after)
+    limit, left = (torque_error(model, task.test) for model in (base, extended))
+    while members and left > limit:
+        found = []
+        for member in members:
+            rest = [m for m in members if m is not member]
+            held = held_out(evidence, [*(rows for m in rest for rows in m.rows), *nuisance])
+            model = _models(task, state, baseline, rest, held)[1]
+            found.append((torque_error(model, task.test), member))
+        left, worst = min(found, key=lambda pair: pair[0])
+        members = [m for m in members if m is not worst]
+        refuted += [worst.finding] if worst.finding is not None else []
+    after = held_out(evidence, [*(rows for m in members for rows in m.rows), *nuisance])
+    return members, after, refuted
 
 
 def _changes(base: DynamicModel, extended: DynamicModel) -> dict[str, float]:

@@ -103,6 +103,13 @@ def doubted(
     return findings
 
 
+def contradicted(finding: Finding) -> Finding:
+    """The finding with the confidence left where its torque raises the torque error of held-out sessions."""
+    grounds = {**finding.grounds, "worse": 1.0}
+    confidence = min(finding.confidence, _OPEN, probability(Grounds(**grounds)))
+    return replace(finding, confidence=confidence, grounds=grounds)
+
+
 def confirmed_delay(task: Task, after: State, claim: Claim, rest: tuple[float, float]) -> Finding:
     """Finding of a late channel, see `timing_finding`, its p-value against the healthy delays of other days.
 

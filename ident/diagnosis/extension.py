@@ -15,6 +15,10 @@ from ident.diagnosis.probes import Remainder
 from ident.diagnosis.result import Finding, Nameless
 from ident.diagnosis.task import Baseline
 from ident.effects import NAMELESS, entry_of
+from ident.estimation.identify import Known
+from ident.estimation.validate import validate
+from ident.model import DynamicModel
+from lwr_driver.session import Session
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +69,14 @@ def power_left(before: HeldOut, after: HeldOut) -> float:
     was, now = before.where(after).rms(), after.where(before).rms()
     share = np.concatenate([(now[side] / np.maximum(was[side], 1e-12)) ** 2 for side in was])
     return float(np.nanmean(share))
+
+
+def torque_error(model: DynamicModel, sessions: Sequence[Session]) -> float:
+    """Torque error of a model in sessions, as `validate` measures it: the mean square over sessions and sides of the
+    relative error of all samples. Infinite without a score."""
+    scores = validate(model, sessions, allow_seen=True, keep_going=True, known=Known()).scores
+    squares = [error**2 for score in scores for error in score.relative.values()]
+    return float(np.mean(squares)) if squares else np.inf
 
 
 def nameless_terms(

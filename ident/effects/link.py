@@ -82,7 +82,7 @@ def _places(setting: Setting) -> tuple[_Encoder, ...]:
 
 
 # Initial compliances over the joint's own (a smaller one is within the joint's tolerance), and a step [rad/Nm].
-_SHARES = (0.3, 0.45, 0.65, 1.0, 1.6)
+_SHARES = (0.3, 0.45, 0.65, 1.0, 1.6, 2.6, 4.2, 7.0)
 _SMALL = 1e-6
 
 
