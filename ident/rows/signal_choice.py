@@ -71,11 +71,13 @@ def choose_signals(
     columns: NDArray[np.int64],
     settings: SignalSettings,
     laws: tuple[Coulomb | None, Coulomb | None] = (None, None),
+    *,
+    outliers: Outliers | None = None,
 ) -> SignalChoice:
     """The figures that `settings` leaves open, and the friction laws, for the sessions of one model.
 
     laws : of the model, None to choose, and of the rows, None for that of the model.
-    payloads : mounted in each session. columns : base columns of the structure.
+    payloads : mounted in each session. columns : base columns of the structure. outliers : as for `prepare`.
     """
     coulomb, row_coulomb = laws
     given = None not in (settings.cutoff_hz, settings.decimate_hz, settings.reversal_s)
@@ -85,7 +87,7 @@ def choose_signals(
     parts = [_excerpt(session, _MOST_S / len(sessions)) for session in sessions]
     rate = min(1.0 / session.joint.period_s for session in parts)
     reasons: list[str] = []
-    outliers = KnownOutliers()
+    outliers = outliers or KnownOutliers()
     found, band = _with_decimation(settings, parts, rate, motor, reasons, outliers)
     rough = [prepare(session, found, motor=motor, log=False, outliers=outliers) for session in parts]
     delays = [0.0 if one.delay is None else one.delay.seconds for one in rough]
@@ -292,11 +294,13 @@ class _Bench:
     def _with_law(self, rows: _ByClass, law: Coulomb) -> _ByClass:
         """The rows with their Coulomb columns anew."""
         names = [split_name(self.structure.names[c]) for c in self.columns]
+        parts = {id(part): part for own in rows.values() for part in own.parts}
+        turned_by = {key: part.turned(law) for key, part in parts.items()}
         found = {}
         for (side, j), own in rows.items():
             matrix = own.matrix.copy()
             turned = np.concatenate(
-                [self._smooth(part.turned(law)[:, j : j + 1], part)[:, 0] for part in own.parts]
+                [self._smooth(turned_by[id(part)][:, j : j + 1], part)[:, 0] for part in own.parts]
             )
             for place, (symbol, link, *_) in enumerate(names):
                 if symbol in ("Fcl", "Fcm") and link == j + 1 and np.any(matrix[:, place]):

@@ -25,6 +25,7 @@ from ident.dynamics.structure import Coupling
 from ident.estimators.problem import Problem
 from ident.rows.filters import SignalSettings
 from ident.rows.sessions import payload_name
+from ident.rows.timebase import KnownOutliers, Outliers
 from ident.screening.channels import check_channels, check_limits, dead
 from ident.screening.doubts import Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, explain, is_wrong, unit_of
@@ -59,44 +60,52 @@ def screen(
     couplings: Sequence[Coupling] = (),
     *,
     motor: bool = True,
+    outliers: Outliers | None = None,
 ) -> tuple[Doubt, ...]:
     """Doubts about the channels of the sessions of one arm.
 
     signals : as for `prepare`. couplings : coupled joints of the motor side. motor : False asks for no doubt about the
-        motor torques; sound ones still tell of the other channels.
+        motor torques; sound ones still tell of the other channels. outliers : as for `prepare`.
 
     Raises ConfigurationError for sessions of other joints than the chain's.
     """
     chosen = [session.select(chain.joint_names) for session in as_sessions(sessions)]
-    found = _doubts(chosen, chain, signals or SignalSettings(), couplings)
+    signals, outliers = signals or SignalSettings(), outliers or KnownOutliers()
+    found = _doubts(chosen, chain, signals, couplings, outliers)
     if motor or not any("motor" in doubt.channel + doubt.seen for doubt in found):
         return found
-    return _doubts(
-        [replace(session, motor=None) for session in chosen], chain, signals or SignalSettings(), ()
-    )
+    return _doubts([replace(session, motor=None) for session in chosen], chain, signals, (), outliers)
 
 
 def _doubts(
-    chosen: Sequence[Session], chain: Chain, signals: SignalSettings, couplings: Sequence[Coupling]
+    chosen: Sequence[Session],
+    chain: Chain,
+    signals: SignalSettings,
+    couplings: Sequence[Coupling],
+    outliers: Outliers,
 ) -> tuple[Doubt, ...]:
     doubts, beyond = check_channels(chosen, chain), check_limits(chosen, chain)
     if any(doubt.certain for doubt in (*doubts, *beyond)):
         # A certain fault bends everything computed from it.
         return (*doubts, *beyond)
-    data = _rows(chosen, chain, signals, couplings)
+    data = _rows(chosen, chain, signals, couplings, outliers)
     contradictions = [] if data is None else _contradictions(data, chosen)
     found = [doubt for doubt in contradictions if not _shared(doubt, doubts)]
     return (*doubts, *found, *(doubt for doubt in beyond if not _shared(doubt, found)))
 
 
 def _rows(
-    sessions: Sequence[Session], chain: Chain, signals: SignalSettings, couplings: Sequence[Coupling]
+    sessions: Sequence[Session],
+    chain: Chain,
+    signals: SignalSettings,
+    couplings: Sequence[Coupling],
+    outliers: Outliers,
 ) -> Redundancy | None:
     """Rows of the sessions, at a higher rate for short ones; None for too few rows for a contradiction."""
     for factor in _RATES:
         faster = replace(signals, decimate_hz=min(factor * signals.decimate, 0.5 * signals.cutoff))
         try:
-            data = Redundancy.of(sessions, chain, faster, couplings, _silent(sessions))
+            data = Redundancy.of(sessions, chain, faster, couplings, _silent(sessions), outliers)
         except LwrError as error:
             # The fit itself says what is too short or does not move.
             logger.info("no screening by redundancy at %g Hz: %s", faster.decimate_hz, error)
@@ -131,9 +140,10 @@ def require_sound(
     couplings: Sequence[Coupling] = (),
     *,
     motor: bool = True,
+    outliers: Outliers | None = None,
 ) -> list[str]:
     """Sentences of `screen` for the report. Raises DataError when a doubt is certain."""
-    return settle(screen(sessions, chain, signals, couplings, motor=motor))
+    return settle(screen(sessions, chain, signals, couplings, motor=motor, outliers=outliers))
 
 
 def _silent(sessions: Sequence[Session]) -> frozenset[Class]:
