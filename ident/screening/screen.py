@@ -14,6 +14,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from ident.dynamics.parameters import INERTIAL, Floats
 from ident.dynamics.regressor import rigid_regressor, torque
 from ident.dynamics.structure import Coupling
 from ident.estimators.problem import Problem
+from ident.rows.content import Kept
 from ident.rows.filters import SignalSettings
 from ident.rows.sessions import payload_name
 from ident.rows.timebase import KnownOutliers, Outliers
@@ -51,6 +53,8 @@ _POSES = 64
 _NOMINAL, _ALIKE, _SEVERAL = 4.0, 0.9, 3
 # Standard deviations of a negative inertia, and least share of its torque in that of the joint.
 _DEVIATIONS, _SHARE = 5.0, 0.1
+# Latest screenings: the same recordings are estimated several times.
+_MOST_SCREENED = 64
 
 
 def screen(
@@ -71,10 +75,14 @@ def screen(
     """
     chosen = [session.select(chain.joint_names) for session in as_sessions(sessions)]
     signals, outliers = signals or SignalSettings(), outliers or KnownOutliers()
-    found = _doubts(chosen, chain, signals, couplings, outliers)
+    look = partial(_doubts, outliers=outliers)
+    found = _screened.of(look, chosen, chain, signals, tuple(couplings))
     if motor or not any("motor" in doubt.channel + doubt.seen for doubt in found):
         return found
-    return _doubts([replace(session, motor=None) for session in chosen], chain, signals, (), outliers)
+    return _screened.of(look, [replace(session, motor=None) for session in chosen], chain, signals, ())
+
+
+_screened = Kept[tuple[Doubt, ...]](_MOST_SCREENED)
 
 
 def _doubts(
@@ -82,6 +90,7 @@ def _doubts(
     chain: Chain,
     signals: SignalSettings,
     couplings: Sequence[Coupling],
+    *,
     outliers: Outliers,
 ) -> tuple[Doubt, ...]:
     doubts, beyond = check_channels(chosen, chain), check_limits(chosen, chain)
