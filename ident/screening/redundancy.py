@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -217,12 +218,12 @@ class Redundancy:
         step = max(1, -(-count // _MOST_ROWS))
         return cls(chain, tuple(r.thinned(step) for r in rows), silent, pairs)
 
-    @property
+    @cached_property
     def sides(self) -> tuple[str, ...]:
         """Measured sides."""
         return tuple(sorted({rows.side for rows in self.rows}))
 
-    @property
+    @cached_property
     def payloads(self) -> tuple[str, ...]:
         """Names of the payloads."""
         return tuple(sorted({rows.payload for rows in self.rows if rows.payload is not None}))
@@ -235,7 +236,7 @@ class Redundancy:
         first += _JOINT * self.chain.n if "joint" in self.sides else 0
         return first + _MOTOR * joint + ("Ia", "Fvm", "Fcm", "offm").index(symbol)
 
-    @property
+    @cached_property
     def width(self) -> int:
         """Number p of parameters."""
         joint, motor = "joint" in self.sides, "motor" in self.sides
