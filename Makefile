@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 TEST_READY := $(VENV)/.test-ready
+# Without its bytecode each process of the tests would compile all modules again.
+unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
 .PHONY: help setup experiment test test-long quick hooks lint browser docs pictures screenshot clean
@@ -50,7 +52,7 @@ lint: $(TEST_READY)
 	$(BIN)/mypy
 
 test: lint browser
-	$(BIN)/pytest -n auto --dist loadfile -m "not long"
+	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder -m "not long"
 
 quick: $(TEST_READY)
 	@$(BIN)/python .ci/quick

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from types import ModuleType
 from typing import Any
+
+
+class _Face(ModuleType):
+    """A package with a name like that of its module: the name stays the package's when the module is imported."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (isinstance(value, ModuleType) and name in self.__all__):
+            super().__setattr__(name, value)
 
 
 def on_first_use(
@@ -15,6 +25,7 @@ def on_first_use(
     face : its `globals()`. homes : names by module; a module below the package begins with a dot.
     """
     package = face["__name__"]
+    sys.modules[package].__class__ = _Face
 
     def find(name: str) -> Any:
         for home, names in homes.items():

@@ -9,15 +9,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fri.errors import LwrError
 from ident.dynamics.kinematics import Chain
-from ident.estimation.identify import Identification
-from ident.excitation import Assembled, ExcitationPlan, PlanProblem, assemble, table_row
 from lwr_driver.configuration import CONFIGS, find
+
+if TYPE_CHECKING:
+    from ident.estimation.identify import Identification
+    from ident.excitation import Assembled, ExcitationPlan
 
 SOURCE = (
     "Kolyubin, Shiriaev, Jubien: Refining Dynamics Identification for Co-Bots: Case Study on KUKA LWR4+. "
@@ -93,6 +95,8 @@ class PredictedMotion:
 
 @cache
 def _assembled() -> Assembled:
+    from ident.excitation import PlanProblem, assemble  # on use: the planner is slow to import
+
     return assemble(PlanProblem.load("plans/default.yaml"))
 
 
@@ -100,6 +104,8 @@ def predicted(plan: ExcitationPlan) -> PredictedMotion | None:
     """The prediction for a plan of the arm of Table 1; None for another arm."""
     if plan.joint_names != _assembled().setup.mechanism.joint_names:
         return None
+    from ident.excitation import table_row
+
     row = table_row("", _assembled(), plan.motion, plan.check)
     return PredictedMotion(
         row.complies, row.condition, row.rsd_mean, row.rsd_worst, tuple(row.torque.tolist())
@@ -109,6 +115,8 @@ def predicted(plan: ExcitationPlan) -> PredictedMotion | None:
 @cache
 def rebuilt(name: str) -> PredictedMotion:
     """The prediction for a motion of Table 1 rebuilt by its rule. name : of `REBUILT`."""
+    from ident.excitation import ExcitationPlan
+
     found = predicted(ExcitationPlan.load(find(REBUILT[name])))
     assert found is not None
     return found
@@ -116,6 +124,8 @@ def rebuilt(name: str) -> PredictedMotion:
 
 def planned(folder: Path) -> tuple[PredictedMotion, str] | None:
     """The prediction for the plan of a run and the objective of its search; None without such a plan."""
+    from ident.excitation import ExcitationPlan
+
     file = folder / "plan.yaml"
     try:
         plan = ExcitationPlan.load(file) if file.is_file() else None

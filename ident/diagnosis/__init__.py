@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from ident.diagnosis.bench import ArmData
-from ident.diagnosis.commission import commission
-from ident.diagnosis.diagnose import diagnose
-from ident.diagnosis.reference import Reference
-from ident.diagnosis.result import Diagnosis, Finding, SimulationError
-from ident.diagnosis.settings import DiagnosisSettings
+from typing import TYPE_CHECKING
+
+from fri.on_first_use import on_first_use
+
+if TYPE_CHECKING:
+    from ident.diagnosis.bench import ArmData
+    from ident.diagnosis.commission import commission
+    from ident.diagnosis.diagnose import diagnose
+    from ident.diagnosis.reference import Reference
+    from ident.diagnosis.result import Diagnosis, Finding, SimulationError
+    from ident.diagnosis.settings import DiagnosisSettings
 
 __all__ = [
     "ArmData",
@@ -19,3 +24,18 @@ __all__ = [
     "commission",
     "diagnose",
 ]
+
+_HOMES = {
+    ".bench": ("ArmData",),
+    ".commission": ("commission",),
+    ".diagnose": ("diagnose",),
+    ".reference": ("Reference",),
+    ".result": (
+        "Diagnosis",
+        "Finding",
+        "SimulationError",
+    ),
+    ".settings": ("DiagnosisSettings",),
+}
+
+__getattr__, __dir__ = on_first_use(globals(), _HOMES)

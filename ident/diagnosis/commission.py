@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import (
@@ -69,6 +68,8 @@ def presliding_length(nominal: Nominal, values: Floats) -> Floats:
     values : base parameters (p,). For each joint by itself, their residual is fitted with the drive's own
     acceleration, speed and offset, and Coulomb friction with each length in turn.
     """
+    from scipy.optimize import minimize_scalar  # on use: its import is slow
+
     n = nominal.arm.chain.n
     lengths = np.zeros(n)
     if "motor" not in nominal.rows:

@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
-from ident.estimation.compare import Comparison, compare, competitor_scores
-from ident.estimation.essential import EssentialSettings
-from ident.estimation.forward_simulation import simulate_session
-from ident.estimation.identify import (
-    ESTIMATORS,
-    EstimatorFactory,
-    Identification,
-    IdentificationSettings,
-    identify,
-)
-from ident.estimation.mounting import Mounting, find_mounting
-from ident.estimation.payload import PayloadEstimate, identify_payload, with_payload
-from ident.estimation.scores import Score, SessionScore, score_session, torque_error
-from ident.estimation.validate import (
-    CrossValidation,
-    Unscored,
-    Validation,
-    cross_validate,
-    mounted,
-    predictor,
-    prepared_session,
-    signals_for,
-    validate,
-)
+from typing import TYPE_CHECKING
+
+from fri.on_first_use import on_first_use
+
+if TYPE_CHECKING:
+    from ident.estimation.compare import Comparison, compare, competitor_scores
+    from ident.estimation.essential import EssentialSettings
+    from ident.estimation.forward_simulation import simulate_session
+    from ident.estimation.identify import (
+        ESTIMATORS,
+        EstimatorFactory,
+        Identification,
+        IdentificationSettings,
+        identify,
+    )
+    from ident.estimation.mounting import Mounting, find_mounting
+    from ident.estimation.payload import PayloadEstimate, identify_payload, with_payload
+    from ident.estimation.scores import Score, SessionScore, score_session, torque_error
+    from ident.estimation.validate import (
+        CrossValidation,
+        Unscored,
+        Validation,
+        cross_validate,
+        mounted,
+        predictor,
+        prepared_session,
+        signals_for,
+        validate,
+    )
 
 __all__ = [
     "ESTIMATORS",
@@ -57,3 +62,48 @@ __all__ = [
     "validate",
     "with_payload",
 ]
+
+_HOMES = {
+    ".compare": (
+        "Comparison",
+        "compare",
+        "competitor_scores",
+    ),
+    ".essential": ("EssentialSettings",),
+    ".forward_simulation": ("simulate_session",),
+    ".identify": (
+        "ESTIMATORS",
+        "EstimatorFactory",
+        "Identification",
+        "IdentificationSettings",
+        "identify",
+    ),
+    ".mounting": (
+        "Mounting",
+        "find_mounting",
+    ),
+    ".payload": (
+        "PayloadEstimate",
+        "identify_payload",
+        "with_payload",
+    ),
+    ".scores": (
+        "Score",
+        "SessionScore",
+        "score_session",
+        "torque_error",
+    ),
+    ".validate": (
+        "CrossValidation",
+        "Unscored",
+        "Validation",
+        "cross_validate",
+        "mounted",
+        "predictor",
+        "prepared_session",
+        "signals_for",
+        "validate",
+    ),
+}
+
+__getattr__, __dir__ = on_first_use(globals(), _HOMES)

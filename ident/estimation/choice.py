@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -254,6 +255,7 @@ class _Comparison:
 
     gains : columns of the gains of `joints`. total : (classes, q, q) of all rows. held : (parts, classes, q, q) of the
     rows of a part. near : the same with the rows beside them, missing in the training.
+    weights : of the candidates so far.
     """
 
     problem: Problem
@@ -267,6 +269,7 @@ class _Comparison:
     block_s: float
     full_rank: bool
     unseen: tuple[str, ...]
+    weights: dict[tuple[str, float | None, bool], Floats] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -415,19 +418,27 @@ class _Comparison:
     def _estimation(self, kind: Kind) -> tuple[NDArray[np.int64], Floats, Prior]:
         """A candidate's columns, weights (classes,) and prior."""
         estimator, scale, tilt, gains = kind
-        p = len(self.problem.names)
-        inner = p + 2 * tilt
+        inner = len(self.problem.names) + 2 * tilt
         used = np.append(np.arange(inner), self.gains[list(gains)])
         mean, precision = np.zeros(len(used)), np.zeros((len(used),) * 2)
-        problem = self.leaning if tilt and self.leaning is not None else self.problem
-        if estimator == "wls" or scale is None:
-            weights = WeightedLeastSquares(_PLAIN).fit(problem).weights
-        else:
-            arm = self._prior(2 * tilt, _TILT_STD_RAD, problem)
-            weights = _tempered(problem, MaximumAPosteriori(arm, scale, _PLAIN).fit(problem))
+        if estimator != "wls" and scale is not None:
+            arm = self._prior(2 * tilt, _TILT_STD_RAD)
             mean[:inner], precision[:inner, :inner] = arm.mean, arm.precision / scale
         precision[range(inner, len(used)), range(inner, len(used))] = _GAIN_STD**-2
-        return used, weights, Prior(mean, precision)
+        return used, self._weights(kind), Prior(mean, precision)
+
+    def _weights(self, kind: Kind) -> Floats:
+        """Weights (classes,) of a candidate, found once whatever its gains."""
+        estimator, scale, tilt, _ = kind
+        if kind[:3] not in self.weights:
+            problem = self.leaning if tilt and self.leaning is not None else self.problem
+            if estimator == "wls" or scale is None:
+                self.weights[kind[:3]] = WeightedLeastSquares(_PLAIN).fit(problem).weights
+            else:
+                arm = self._prior(2 * tilt, _TILT_STD_RAD)
+                fit = MaximumAPosteriori(arm, scale, _PLAIN).fit(problem)
+                self.weights[kind[:3]] = _tempered(problem, fit)
+        return self.weights[kind[:3]]
 
     def _solved(self, kind: Kind) -> tuple[Floats, Floats]:
         """Values (k,) and covariance (k, k) of a candidate from all rows."""
@@ -483,19 +494,26 @@ class _Comparison:
         shift[p:-1, -1], shift[-1, -1] = -values[p:], 1.0
         power, vectors = np.linalg.eigh(shift.T @ normal @ shift)
         root = np.sqrt(np.maximum(power, 0.0))[:, None] * vectors.T
-        weak = (
-            np.diag(self._prior(0, 1.0, self.problem).precision - self.bodies.prior("pullback").precision)
-            / scale
-        )
+        weak = np.diag(self._completed.precision - self._stated.precision) / scale
         matrix = np.vstack([root[:, :p], np.diag(np.sqrt(np.maximum(weak, 0.0)))])
         target = np.append(root[:, p], np.zeros(p))
         standard = PhysicallyConsistent(self.bodies).solve(scale, matrix @ self.bodies.projection, target)
         return np.concatenate([self.bodies.projection @ standard, values[p:]])
 
-    def _prior(self, extra: int, std: float, problem: Problem) -> Prior:
-        """The URDF's prior of the parameters, and `extra` columns of mean zero and standard deviation `std`."""
+    @cached_property
+    def _stated(self) -> Prior:
+        """The URDF's prior of the parameters."""
         assert self.bodies is not None
-        arm = self.bodies.prior("pullback").completed(self.problem)
+        return self.bodies.prior("pullback")
+
+    @cached_property
+    def _completed(self) -> Prior:
+        """The same, with a weak prior of what the rows leave open."""
+        return self._stated.completed(self.problem)
+
+    def _prior(self, extra: int, std: float) -> Prior:
+        """The URDF's prior of the parameters, and `extra` columns of mean zero and standard deviation `std`."""
+        arm = self._completed
         p = len(arm.mean)
         precision = np.zeros((p + extra, p + extra))
         precision[:p, :p] = arm.precision
@@ -515,9 +533,7 @@ class _Comparison:
     def _disagreement(self) -> Disagreement | None:
         if self.bodies is None:
             return None
-        prior = self.bodies.prior("pullback")
-        fit = MaximumAPosteriori(prior, 1.0, _PLAIN).fit(self.problem)
-        return Disagreement.between(prior, self.problem, _tempered(self.problem, fit))
+        return Disagreement.between(self._stated, self.problem, self._weights(("physical", 1.0, False, ())))
 
     def _worse_joints(self, candidates: Sequence[Candidate], squares: Floats, chosen: int) -> Iterator[str]:
         """Joints that the winner predicts worse than least squares, beyond two standard errors."""

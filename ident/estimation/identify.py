@@ -33,6 +33,7 @@ from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
 from ident.rows.sessions import payload_name, require
 from ident.rows.signal_choice import choose_signals
+from ident.rows.timebase import KnownOutliers
 from ident.screening.screen import require_sound, without_dead
 from lwr_driver.listing import Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
@@ -412,14 +413,18 @@ def observed(
         settings.coulomb or Coulomb(),
         () if sensed else ("motor",),
     )
-    first = known is None
+    first, outliers = known is None, KnownOutliers()
     if known is None:
-        found = require_sound(chosen, chain, settings.signals, settings.couplings, motor=needs_motor)
+        found = require_sound(
+            chosen, chain, settings.signals, settings.couplings, motor=needs_motor, outliers=outliers
+        )
         known = Known(tuple(found))
     mounted = payloads if settings.model != 3 else [None] * len(payloads)
     base = numeric_base(structure, _conditions(structure, chosen, mounted))
     laws = (settings.coulomb, settings.row_coulomb)
-    signals = choose_signals(chosen, mounted, structure, base.columns, settings.signals, laws)
+    signals = choose_signals(
+        chosen, mounted, structure, base.columns, settings.signals, laws, outliers=outliers
+    )
     known = replace(known, signal_reasons=known.signal_reasons or signals.reasons)
     rows_structure = replace(structure, coulomb=signals.row_coulomb)
     structure = replace(structure, coulomb=signals.coulomb)
@@ -438,6 +443,7 @@ def observed(
             log=first,
             advise=not known.signal_reasons,
             blocks=True,
+            outliers=outliers,
         )
         seen = observe(
             [whole], [payload], rows_structure, columns=base.columns, names=base.names, units=base.units

@@ -17,10 +17,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.parameters import Floats
+from ident.dynamics.parameters import INERTIAL, Floats
+from ident.dynamics.regressor import torque
+from ident.dynamics.structure import ModelStructure, Side
 from ident.effects.link import sideways_gravity
 from ident.estimation.identify import Identification, IdentificationSettings, Known, identify
 from ident.estimators.covariance import CovarianceSettings
@@ -216,14 +219,8 @@ def _columns(
 ) -> list[Floats]:
     """Torque (m, 2) of each row group at rest under each gravity, the change of torque for one of gravity."""
     structure, settings = found.structure, found.settings
-    structures = [
-        replace(
-            structure,
-            chain=replace(structure.chain, gravity=direction),
-            without=(*structure.without, "offl", "offm"),
-        )
-        for direction in directions
-    ]
+    chains = tuple(replace(structure.chain, gravity=direction) for direction in directions)
+    leaning = _Leaning(structure, chains, found.base.columns, found.estimate.values)
     result = []
     for session, payload in zip(sessions, found.payloads, strict=True):
         chosen = session.select(structure.chain.joint_names)
@@ -236,10 +233,53 @@ def _columns(
             blocks=True,
         )
         still = _at_rest(moving)
-        groups = [observe([still], [payload], s, columns=found.base.columns).groups for s in structures]
-        for pair in zip(*groups, strict=True):
-            result.append(np.column_stack([group.matrix @ found.estimate.values for group in pair]))
+        result += [group.matrix for group in observe([still], [payload], leaning).groups]
     return result
+
+
+@dataclass(frozen=True)
+class _Leaning:
+    """The torque of an arm at rest, with known parameters, under several gravities: a column each of a regressor.
+
+    chains : the arm under each gravity. columns, values : (p,), of the structure, and their parameters.
+    """
+
+    structure: ModelStructure
+    chains: tuple[Chain, ...]
+    columns: NDArray[np.int64]
+    values: Floats
+
+    @property
+    def chain(self) -> Chain:
+        """The arm."""
+        return self.structure.chain
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """Sides of the rows."""
+        return self.structure.sides
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """One a gravity."""
+        return tuple(f"tilt_{k + 1}" for k in range(len(self.chains)))
+
+    @property
+    def active(self) -> NDArray[np.bool_]:
+        """All of them."""
+        return np.ones(len(self.chains), dtype=bool)
+
+    def regressor(
+        self, q: Floats, qd: Floats, qdd: Floats, *, payload: str | None, sides: Sequence[Side], **rest: Any
+    ) -> Floats:
+        """(sides x n x N, gravities): as `ModelStructure.regressor`, at rest."""
+        bodies = np.zeros((self.chain.n, len(INERTIAL)))
+        for column, value in zip(self.columns.tolist(), self.values, strict=True):
+            if (place := self.structure.rigid_of(column, payload)) is not None:
+                bodies[place] += value
+        still = np.zeros_like(q)
+        torques = [torque(chain, q, still, still, bodies).T for chain in self.chains]
+        return np.array([[own] * len(sides) for own in torques]).reshape(len(torques), -1).T
 
 
 def _at_rest(session: PreparedSession) -> PreparedSession:

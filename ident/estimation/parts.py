@@ -15,9 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.ndimage import maximum_filter1d
-from scipy.optimize import linear_sum_assignment
 
 from ident.dynamics.parameters import Floats
 from ident.estimators.problem import Problem
@@ -52,6 +50,9 @@ def held_back_parts(
             key = group.record, int(numbers[place])
             sums.setdefault(key, np.zeros((len(labels), size)))[labels[group.label]] += total
             rows.setdefault(key, np.zeros(len(labels), dtype=np.int64))[labels[group.label]] += n
+    from scipy.cluster.hierarchy import fcluster, linkage  # on use: slow imports
+    from scipy.optimize import linear_sum_assignment
+
     table: dict[tuple[int, int], int] = {}
     centres: Floats | None = None
     conditions = list(dict.fromkeys(payloads[record] for record, _ in sums))

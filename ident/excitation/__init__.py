@@ -17,22 +17,29 @@ The search runs through `joblib`; its configured backend spreads it over process
 The result depends on the seed and the counts of the problem file, not on the backend or the number of processes.
 """
 
-from ident.excitation.arm_model import ArmEstimate, Mechanism, Noise
-from ident.excitation.assembly import Assembled, arm_limits, assemble
-from ident.excitation.check import Check, Limits, Margin, Workspace, check_motion
-from ident.excitation.comparison import (
-    TableRow,
-    hypervolume,
-    not_dominated,
-    random_points,
-    table,
-    table_row,
-    trade_off,
-)
-from ident.excitation.motions import FourierBasis, FourierSeries, PointToPoint, SplineBasis, SplineMotion
-from ident.excitation.plan import ExcitationPlan, plan_pieces
-from ident.excitation.planner import Progress, feasible_fourier, plan
-from ident.excitation.problem import Knowledge, MotionForm, Objective, PlanProblem, Prior, Search
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from fri.on_first_use import on_first_use
+
+if TYPE_CHECKING:
+    from ident.excitation.arm_model import ArmEstimate, Mechanism, Noise
+    from ident.excitation.assembly import Assembled, arm_limits, assemble
+    from ident.excitation.check import Check, Limits, Margin, Workspace, check_motion
+    from ident.excitation.comparison import (
+        TableRow,
+        hypervolume,
+        not_dominated,
+        random_points,
+        table,
+        table_row,
+        trade_off,
+    )
+    from ident.excitation.motions import FourierBasis, FourierSeries, PointToPoint, SplineBasis, SplineMotion
+    from ident.excitation.plan import ExcitationPlan, plan_pieces
+    from ident.excitation.planner import Progress, feasible_fourier, plan
+    from ident.excitation.problem import Knowledge, MotionForm, Objective, PlanProblem, Prior, Search
 
 __all__ = [
     "ArmEstimate",
@@ -70,3 +77,58 @@ __all__ = [
     "table_row",
     "trade_off",
 ]
+
+_HOMES = {
+    ".arm_model": (
+        "ArmEstimate",
+        "Mechanism",
+        "Noise",
+    ),
+    ".assembly": (
+        "Assembled",
+        "arm_limits",
+        "assemble",
+    ),
+    ".check": (
+        "Check",
+        "Limits",
+        "Margin",
+        "Workspace",
+        "check_motion",
+    ),
+    ".comparison": (
+        "TableRow",
+        "hypervolume",
+        "not_dominated",
+        "random_points",
+        "table",
+        "table_row",
+        "trade_off",
+    ),
+    ".motions": (
+        "FourierBasis",
+        "FourierSeries",
+        "PointToPoint",
+        "SplineBasis",
+        "SplineMotion",
+    ),
+    ".plan": (
+        "ExcitationPlan",
+        "plan_pieces",
+    ),
+    ".planner": (
+        "Progress",
+        "feasible_fourier",
+        "plan",
+    ),
+    ".problem": (
+        "Knowledge",
+        "MotionForm",
+        "Objective",
+        "PlanProblem",
+        "Prior",
+        "Search",
+    ),
+}
+
+__getattr__, __dir__ = on_first_use(globals(), _HOMES)

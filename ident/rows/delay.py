@@ -13,7 +13,6 @@ Ia by -Fvm d, so its uncertainty enters the covariance of every estimate.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,8 +26,9 @@ from ident.dynamics.parameters import Floats
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem, RowGroup
+from ident.rows.content import Kept
 from ident.rows.filters import ParallelFilter, half_width, interpolate_uniform, low_pass
-from lwr_driver.session.spool import Growing, release, spans
+from lwr_driver.session.spool import Growing, release
 
 logger = logging.getLogger(__name__)
 
@@ -49,9 +49,7 @@ _ELASTIC_S = 2e-3
 _DECISIVE = 25.0
 # A delay within this many standard deviations of zero is not told apart from zero.
 _DISTINCT = 1.96
-# Arrays of `DelayData`.
-_ARRAYS = ("times", "qd", "qdd", "joint_torque", "known", "motor_times", "motor_torque")
-# Latest estimates by the digest of their data: an estimator prepares a session several times.
+# Latest estimates: an estimator prepares a session several times.
 _MOST_ESTIMATES = 64
 
 
@@ -107,7 +105,7 @@ class Delay:
         return f"late by {1e3 * self.seconds:.2f} ms ({low:.2f} to {high:.2f} ms, {self.how})"
 
 
-_estimates: dict[bytes, Delay] = {}
+_estimates = Kept[Delay](_MOST_ESTIMATES)
 
 
 @dataclass(frozen=True)
@@ -142,31 +140,9 @@ def estimate_delay(
     A motion too short or too weak for an estimate gives zero, with the sample time of the motor channel as its
     standard deviation. Raises DataError when the data clearly prefer a delay at the edge of +- `search_s`.
     """
-    key = _identity(stretches, (tuple(joint_names), cutoff_hz, search_s))
-    found = _estimates.pop(key, None) or _estimated(stretches, joint_names, cutoff_hz, search_s)
-    _estimates[key] = found
-    while len(_estimates) > _MOST_ESTIMATES:
-        _estimates.pop(next(iter(_estimates)))
+    found = _estimates.of(_estimated, stretches, tuple(joint_names), cutoff_hz, search_s)
     logger.info("motor channel %s", found)
     return found
-
-
-def _identity(stretches: Sequence[DelayData], rest: object) -> bytes:
-    """Digest of the data and of the other arguments of an estimate."""
-    known: dict[int, bytes] = {}  # blocks of a stretch share the arrays of the motor channel
-    whole = hashlib.blake2b(repr(rest).encode(), digest_size=16)
-    for data in stretches:
-        whole.update(repr((data.span, data.core)).encode())
-        for name in _ARRAYS:
-            array = getattr(data, name)
-            if id(array) not in known:
-                own = hashlib.blake2b(repr((array.shape, array.dtype)).encode(), digest_size=16)
-                for some in spans(len(array)):
-                    own.update(np.ascontiguousarray(array[some]).data)
-                release(array)
-                known[id(array)] = own.digest()
-            whole.update(known[id(array)])
-    return whole.digest()
 
 
 def _estimated(

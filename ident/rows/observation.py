@@ -10,18 +10,19 @@ the true motion and is independent of the sensors. `InstrumentalVariables` and t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from fri.errors import DataError
+from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
-from ident.dynamics.structure import ModelStructure, Side
+from ident.dynamics.structure import Side
 from ident.estimators.problem import Nuisance, Problem, RowGroup
 from ident.rows.filters import (
     ParallelFilter,
@@ -37,6 +38,31 @@ from ident.rows.timebase import Stretch, sample_period, stretches
 from lwr_driver.session import Session
 from lwr_driver.session.spool import Growing, release
 
+
+class Columns(Protocol):
+    """What `observe` needs of a structure."""
+
+    @property
+    def chain(self) -> Chain:
+        """The arm."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all columns."""
+
+    @property
+    def active(self) -> NDArray[np.bool_]:
+        """Columns in use."""
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """Sides of the rows."""
+
+    @property
+    def regressor(self) -> Callable[..., Floats]:
+        """Observation matrix, as `ModelStructure.regressor`."""
+
+
 # Rows with their full-rate regressor in memory at a time.
 _BLOCKS = 4
 
@@ -44,7 +70,7 @@ _BLOCKS = 4
 def observe(
     sessions: Sequence[PreparedSession],
     payloads: Sequence[str | None],
-    structure: ModelStructure,
+    structure: Columns,
     *,
     columns: Sequence[int] | NDArray[np.int64] | None = None,
     names: Sequence[str] | None = None,
@@ -138,7 +164,7 @@ class _Part:
 def _side(
     passage: Passage,
     side: Side,
-    structure: ModelStructure,
+    structure: Columns,
     payload: str | None,
     columns: NDArray[np.int64],
     session: PreparedSession,
@@ -186,7 +212,7 @@ def _filtered(
     channel: TorqueChannel,
     rows: Floats,
     side: Side,
-    structure: ModelStructure,
+    structure: Columns,
     payload: str | None,
     columns: NDArray[np.int64],
     session: PreparedSession,

@@ -20,6 +20,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 from ident.dynamics.parameters import Floats, split_name
 from ident.dynamics.structure import Coulomb, ModelStructure
 from ident.rows.binned import BinnedRows, observe_bins
+from ident.rows.content import Kept
 from ident.rows.data_quality import passed_band
 from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass
 from ident.rows.prepare import prepare
@@ -52,6 +54,8 @@ _WORTH = 0.005
 _RIDGE = 1e-10
 # Rows of a joint for an error of its own.
 _LEAST = 8
+# Latest choices: the same recordings are estimated several times.
+_MOST_CHOICES = 64
 
 
 @dataclass(frozen=True)
@@ -71,21 +75,46 @@ def choose_signals(
     columns: NDArray[np.int64],
     settings: SignalSettings,
     laws: tuple[Coulomb | None, Coulomb | None] = (None, None),
+    *,
+    outliers: Outliers | None = None,
 ) -> SignalChoice:
     """The figures that `settings` leaves open, and the friction laws, for the sessions of one model.
 
     laws : of the model, None to choose, and of the rows, None for that of the model.
-    payloads : mounted in each session. columns : base columns of the structure.
+    payloads : mounted in each session. columns : base columns of the structure. outliers : as for `prepare`.
     """
     coulomb, row_coulomb = laws
     given = None not in (settings.cutoff_hz, settings.decimate_hz, settings.reversal_s)
     if given and coulomb is not None:
         return SignalChoice(settings, coulomb, row_coulomb or coulomb)
-    motor = structure.sides != ("joint",)
     parts = [_excerpt(session, _MOST_S / len(sessions)) for session in sessions]
+    made = _choices.of(
+        partial(_chosen, outliers=outliers or KnownOutliers()),
+        parts, tuple(payloads), structure, columns, settings, laws,
+    )  # fmt: skip
+    for reason in made.reasons:
+        logger.info("%s", reason)
+    return made
+
+
+_choices = Kept[SignalChoice](_MOST_CHOICES)
+
+
+def _chosen(
+    parts: Sequence[Session],
+    payloads: Sequence[str | None],
+    structure: ModelStructure,
+    columns: NDArray[np.int64],
+    settings: SignalSettings,
+    laws: tuple[Coulomb | None, Coulomb | None],
+    *,
+    outliers: Outliers,
+) -> SignalChoice:
+    """The choice for the parts of the sessions in use."""
+    coulomb, row_coulomb = laws
+    motor = structure.sides != ("joint",)
     rate = min(1.0 / session.joint.period_s for session in parts)
     reasons: list[str] = []
-    outliers = KnownOutliers()
     found, band = _with_decimation(settings, parts, rate, motor, reasons, outliers)
     rough = [prepare(session, found, motor=motor, log=False, outliers=outliers) for session in parts]
     delays = [0.0 if one.delay is None else one.delay.seconds for one in rough]
@@ -98,8 +127,6 @@ def choose_signals(
     if found.reversal_s is None:
         found = replace(found, reversal_s=_reversal_s(rows, band, found.standstill_rad_s, reasons))
     law, row_law = (coulomb, row_coulomb or coulomb) if coulomb else bench.laws(rows, found, reasons)
-    for reason in reasons:
-        logger.info("%s", reason)
     return SignalChoice(found, law, row_law, tuple(reasons))
 
 
@@ -292,11 +319,13 @@ class _Bench:
     def _with_law(self, rows: _ByClass, law: Coulomb) -> _ByClass:
         """The rows with their Coulomb columns anew."""
         names = [split_name(self.structure.names[c]) for c in self.columns]
+        parts = {id(part): part for own in rows.values() for part in own.parts}
+        turned_by = {key: part.turned(law) for key, part in parts.items()}
         found = {}
         for (side, j), own in rows.items():
             matrix = own.matrix.copy()
             turned = np.concatenate(
-                [self._smooth(part.turned(law)[:, j : j + 1], part)[:, 0] for part in own.parts]
+                [self._smooth(turned_by[id(part)][:, j : j + 1], part)[:, 0] for part in own.parts]
             )
             for place, (symbol, link, *_) in enumerate(names):
                 if symbol in ("Fcl", "Fcm") and link == j + 1 and np.any(matrix[:, place]):

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from ident.dynamics.structure import Coupling
 from ident.rows.filters import ParallelFilter, SignalSettings, block_means, thinning
 from ident.rows.prepare import TorqueChannel, prepare
 from ident.rows.sessions import payload_name
+from ident.rows.timebase import Outliers, flag_outliers
 from lwr_driver.session import Session
 
 Class = tuple[str, int]
@@ -81,14 +83,18 @@ class SampledRows:
 
 
 def sampled(
-    sessions: Sequence[Session], signals: SignalSettings, couplings: Sequence[tuple[int, int]] = ()
+    sessions: Sequence[Session],
+    signals: SignalSettings,
+    couplings: Sequence[tuple[int, int]] = (),
+    outliers: Outliers = flag_outliers,
 ) -> list[SampledRows]:
     """Rows of all sides of the sessions, without an estimated delay. Raises DataError like `prepare`."""
     found = []
     for record, session in enumerate(sessions):
         sensed = bool(session.joint.effort.shape[1])
         wanted = replace(signals, motor_delay_s=0.0)
-        whole = prepare(session, wanted, motor=session.motor is not None, log=False, blocks=True)
+        motor = session.motor is not None
+        whole = prepare(session, wanted, motor=motor, log=False, blocks=True, outliers=outliers)
         # Blocks of one stretch, side by side.
         runs: list[dict[str, list[SampledRows]]] = []
         for passage in whole.passages:
@@ -202,21 +208,22 @@ class Redundancy:
         signals: SignalSettings,
         couplings: Sequence[Coupling] = (),
         silent: frozenset[Class] = frozenset(),
+        outliers: Outliers = flag_outliers,
     ) -> Redundancy:
-        """Rows of the sessions, at most about `_MOST_ROWS` a side."""
+        """Rows of the sessions, at most about `_MOST_ROWS` a side. outliers : as for `prepare`."""
         places = [tuple(chain.joint_names.index(name) for name in pair.joints) for pair in couplings]
         pairs = tuple((a, b) for a, b in places)
-        rows = sampled(sessions, signals, pairs)
+        rows = sampled(sessions, signals, pairs, outliers)
         count = max((sum(len(r.q) for r in rows if r.side == side) for side in ("joint", "motor")), default=0)
         step = max(1, -(-count // _MOST_ROWS))
         return cls(chain, tuple(r.thinned(step) for r in rows), silent, pairs)
 
-    @property
+    @cached_property
     def sides(self) -> tuple[str, ...]:
         """Measured sides."""
         return tuple(sorted({rows.side for rows in self.rows}))
 
-    @property
+    @cached_property
     def payloads(self) -> tuple[str, ...]:
         """Names of the payloads."""
         return tuple(sorted({rows.payload for rows in self.rows if rows.payload is not None}))
@@ -229,7 +236,7 @@ class Redundancy:
         first += _JOINT * self.chain.n if "joint" in self.sides else 0
         return first + _MOTOR * joint + ("Ia", "Fvm", "Fcm", "offm").index(symbol)
 
-    @property
+    @cached_property
     def width(self) -> int:
         """Number p of parameters."""
         joint, motor = "joint" in self.sides, "motor" in self.sides

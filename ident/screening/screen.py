@@ -14,6 +14,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -23,8 +24,10 @@ from ident.dynamics.parameters import INERTIAL, Floats
 from ident.dynamics.regressor import rigid_regressor, torque
 from ident.dynamics.structure import Coupling
 from ident.estimators.problem import Problem
+from ident.rows.content import Kept
 from ident.rows.filters import SignalSettings
 from ident.rows.sessions import payload_name
+from ident.rows.timebase import KnownOutliers, Outliers
 from ident.screening.channels import check_channels, check_limits, dead
 from ident.screening.doubts import Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, explain, is_wrong, unit_of
@@ -50,6 +53,8 @@ _POSES = 64
 _NOMINAL, _ALIKE, _SEVERAL = 4.0, 0.9, 3
 # Standard deviations of a negative inertia, and least share of its torque in that of the joint.
 _DEVIATIONS, _SHARE = 5.0, 0.1
+# Latest screenings: the same recordings are estimated several times.
+_MOST_SCREENED = 64
 
 
 def screen(
@@ -59,44 +64,57 @@ def screen(
     couplings: Sequence[Coupling] = (),
     *,
     motor: bool = True,
+    outliers: Outliers | None = None,
 ) -> tuple[Doubt, ...]:
     """Doubts about the channels of the sessions of one arm.
 
     signals : as for `prepare`. couplings : coupled joints of the motor side. motor : False asks for no doubt about the
-        motor torques; sound ones still tell of the other channels.
+        motor torques; sound ones still tell of the other channels. outliers : as for `prepare`.
 
     Raises ConfigurationError for sessions of other joints than the chain's.
     """
     chosen = [session.select(chain.joint_names) for session in as_sessions(sessions)]
-    found = _doubts(chosen, chain, signals or SignalSettings(), couplings)
+    signals, outliers = signals or SignalSettings(), outliers or KnownOutliers()
+    look = partial(_doubts, outliers=outliers)
+    found = _screened.of(look, chosen, chain, signals, tuple(couplings))
     if motor or not any("motor" in doubt.channel + doubt.seen for doubt in found):
         return found
-    return _doubts(
-        [replace(session, motor=None) for session in chosen], chain, signals or SignalSettings(), ()
-    )
+    return _screened.of(look, [replace(session, motor=None) for session in chosen], chain, signals, ())
+
+
+_screened = Kept[tuple[Doubt, ...]](_MOST_SCREENED)
 
 
 def _doubts(
-    chosen: Sequence[Session], chain: Chain, signals: SignalSettings, couplings: Sequence[Coupling]
+    chosen: Sequence[Session],
+    chain: Chain,
+    signals: SignalSettings,
+    couplings: Sequence[Coupling],
+    *,
+    outliers: Outliers,
 ) -> tuple[Doubt, ...]:
     doubts, beyond = check_channels(chosen, chain), check_limits(chosen, chain)
     if any(doubt.certain for doubt in (*doubts, *beyond)):
         # A certain fault bends everything computed from it.
         return (*doubts, *beyond)
-    data = _rows(chosen, chain, signals, couplings)
+    data = _rows(chosen, chain, signals, couplings, outliers)
     contradictions = [] if data is None else _contradictions(data, chosen)
     found = [doubt for doubt in contradictions if not _shared(doubt, doubts)]
     return (*doubts, *found, *(doubt for doubt in beyond if not _shared(doubt, found)))
 
 
 def _rows(
-    sessions: Sequence[Session], chain: Chain, signals: SignalSettings, couplings: Sequence[Coupling]
+    sessions: Sequence[Session],
+    chain: Chain,
+    signals: SignalSettings,
+    couplings: Sequence[Coupling],
+    outliers: Outliers,
 ) -> Redundancy | None:
     """Rows of the sessions, at a higher rate for short ones; None for too few rows for a contradiction."""
     for factor in _RATES:
         faster = replace(signals, decimate_hz=min(factor * signals.decimate, 0.5 * signals.cutoff))
         try:
-            data = Redundancy.of(sessions, chain, faster, couplings, _silent(sessions))
+            data = Redundancy.of(sessions, chain, faster, couplings, _silent(sessions), outliers)
         except LwrError as error:
             # The fit itself says what is too short or does not move.
             logger.info("no screening by redundancy at %g Hz: %s", faster.decimate_hz, error)
@@ -131,9 +149,10 @@ def require_sound(
     couplings: Sequence[Coupling] = (),
     *,
     motor: bool = True,
+    outliers: Outliers | None = None,
 ) -> list[str]:
     """Sentences of `screen` for the report. Raises DataError when a doubt is certain."""
-    return settle(screen(sessions, chain, signals, couplings, motor=motor))
+    return settle(screen(sessions, chain, signals, couplings, motor=motor, outliers=outliers))
 
 
 def _silent(sessions: Sequence[Session]) -> frozenset[Class]:

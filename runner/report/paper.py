@@ -30,6 +30,7 @@ JOINT_WORDS = ("numbers", "names")
 _STYLE: Mapping[str, Any] = {
     "mathtext.fontset": "stix",
     "font.size": 8.0,
+    "axes.titley": 1.0,  # above the axes, without a search for ticks there
     "axes.titlesize": 8.0,
     "axes.labelsize": 8.0,
     "xtick.labelsize": 7.0,

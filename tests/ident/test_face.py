@@ -60,6 +60,37 @@ def test_the_face_alone_loads_nothing_heavy() -> None:
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == ""
 
 
+@pytest.mark.parametrize(
+    ("package", "name"),
+    [
+        ("diagnosis", "diagnose"),
+        ("estimation", "identify"),
+        ("estimation", "compare"),
+        ("excitation", "plan"),
+    ],
+)
+def test_a_name_like_that_of_its_module_is_the_function_before_and_after_an_import(
+    package: str, name: str
+) -> None:
+    code = (
+        f"import inspect, ident.{package} as face; from importlib import import_module; "
+        f"first = face.{name}; import_module('ident.{package}.{name}'); import ident.{package}.{name}; "
+        f"print(inspect.isfunction(first), face.{name} is first, '{name}' in dir(face))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.split() == ["True"] * 3, done.stderr
+
+
+def test_words_of_a_diagnosis_need_no_planner_and_the_package_no_numpy() -> None:
+    code = (
+        "import sys, ident.diagnosis; assert 'numpy' not in sys.modules; import runner.ending; "
+        "print(*{'pinocchio', 'coal', 'ident.excitation.assembly', 'scipy.optimize'} & {*sys.modules})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "", done.stdout
+    assert not done.stderr, done.stderr
+
+
 def test_a_model_file_stands_for_a_model(found: Any, logs: tuple[Path, Path], tmp_path: Path) -> None:
     path = tmp_path / "model.yaml"
     write_model(found.model, path)

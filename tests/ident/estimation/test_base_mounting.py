@@ -9,11 +9,15 @@ import pytest
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
-from ident.estimation.identify import IdentificationSettings
-from ident.estimation.mounting import find_mounting
+from ident.estimation.identify import IdentificationSettings, identify
+from ident.estimation.mounting import find_mounting, tilt_columns
 from ident.estimators import nearest_consistent
+from ident.rows.filters import SignalSettings
+from ident.rows.observation import observe
+from ident.rows.prepare import TorqueChannel, prepare
 from lwr_driver.configuration import find
 from lwr_driver.session import JointColumns, Session
+from tests.ident import estimation_arm
 
 RATE_HZ = 100.0
 MODEL_1 = IdentificationSettings(model=1, essential=None, estimator="physical")
@@ -101,3 +105,39 @@ def test_model_3_and_a_chain_without_gravity_are_refused() -> None:
     weightless = dataclasses.replace(upright(), gravity=np.zeros(3))
     with pytest.raises(ConfigurationError, match="no gravity"):
         find_mounting([session], weightless, MODEL_1)
+
+
+def test_the_columns_of_a_tilt_are_the_torques_of_a_turned_gravity_on_both_sides_and_of_the_payload() -> None:
+    arm = estimation_arm.chain()
+    sessions = [estimation_arm.session(), estimation_arm.session(loaded=True)]
+    settings = IdentificationSettings(essential=None, signals=SignalSettings(10.0, decimate_hz=2.0))
+    found = identify(sessions, arm, settings)
+    columns = tilt_columns(found, sessions)
+    structure, count = found.structure, 0
+    assert structure.sides == ("motor", "joint")
+    assert structure.payloads == ("payload",)
+    for k, axis in enumerate(np.eye(3)[:2]):
+        # Gravity turned about the axis, linear in the angle.
+        chain = dataclasses.replace(arm, gravity=-np.cross(axis, arm.gravity))
+        turned = dataclasses.replace(structure, chain=chain, without=("offl", "offm"))
+        for record, session in enumerate(sessions):
+            whole = prepare(session, found.settings.signals, log=False)
+            still = dataclasses.replace(
+                whole,
+                passages=tuple(
+                    dataclasses.replace(p, **{side: at_rest(getattr(p, side)) for side in ("joint", "motor")})
+                    for p in whole.passages
+                ),
+            )
+            groups = observe([still], [found.payloads[record]], turned, columns=found.base.columns).groups
+            mine = [c for c, g in zip(columns, found.problem.groups, strict=True) if g.record == record]
+            for group, column in zip(groups, mine, strict=True):
+                expected = group.matrix @ found.estimate.values
+                np.testing.assert_allclose(column[:, k], expected, rtol=1e-9, atol=1e-9)
+                count += bool(np.any(expected))
+    assert count > 20
+
+
+def at_rest(channel: TorqueChannel) -> TorqueChannel:
+    zero = np.zeros_like(channel.qd)
+    return dataclasses.replace(channel, qd=zero, qdd=zero, drive=None)

@@ -9,6 +9,7 @@ import pytest
 
 import ident.rows.delay as module
 from fri.errors import DataError
+from ident.rows.content import Kept
 from ident.rows.delay import Delay, DelayData, _misfit, _Rows, estimate_delay
 from ident.rows.filters import SignalSettings, differentiate
 from ident.rows.prepare import prepare
@@ -123,7 +124,7 @@ def test_equal_data_are_estimated_once_and_each_other_argument_anew(monkeypatch:
         calls.append(arguments)
         return Delay(1e-3 * len(calls), 1e-4, "counted")
 
-    monkeypatch.setattr(module, "_estimates", {})
+    monkeypatch.setattr(module, "_estimates", Kept(8))
     monkeypatch.setattr(module, "_estimated", estimated)
     first, joints = data(0.01, seconds=8.0), ("A1", "A2")
     assert estimate_delay([first], joints) == estimate_delay([data(0.01, seconds=8.0)], joints)

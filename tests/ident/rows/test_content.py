@@ -1,0 +1,137 @@
+"""Results kept by content: equal data give the kept result, any difference a new one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import ModelStructure
+from ident.rows import signal_choice
+from ident.rows.content import Kept, content
+from ident.rows.filters import SignalSettings
+from ident.rows.signal_choice import choose_signals
+from lwr_driver.session import Session
+from tests.ident.estimation_arm import Sensors, chain, session
+
+screening = import_module("ident.screening.screen")
+SHORT = SignalSettings(cutoff_hz=10.0, decimate_hz=2.0, reversal_s=0.05)
+
+
+@dataclass(frozen=True)
+class Pair:
+    first: Any
+    second: Any
+
+
+THINGS = [
+    None, True, 1, 1.0, "1", b"1", 0.5, np.float64(0.5), (), [1, 2], [2, 1], ((1,), 2), (1, (2,)), {"a": 1},
+    {"a": 2}, {"b": 1}, frozenset({1, 2}), Path("a"), "a", Pair(1, 2), Pair(2, 1), np.arange(3), np.arange(4),
+    np.arange(3.0), np.arange(3.0)[:, None], np.array([0.0, 1.0, 2.0 + 1e-15]), np.array(1.0), np.zeros((0, 2)),
+]  # fmt: skip
+
+
+def test_things_of_equal_content_have_one_digest_and_others_another() -> None:
+    digests = [content(thing) for thing in THINGS]
+    assert len(set(digests)) == len(THINGS)
+    copies = [thing.copy() if isinstance(thing, np.ndarray) else thing for thing in THINGS]
+    assert [content(thing) for thing in copies] == digests
+    assert content(1, 2) != content((1, 2))
+
+
+@pytest.mark.parametrize("thing", [object(), lambda: None, np.array([object()]), int])
+def test_what_has_no_plain_content_is_refused(thing: Any) -> None:
+    with pytest.raises(TypeError, match="no plain content"):
+        content(thing)
+
+
+def test_an_array_changed_in_place_is_another() -> None:
+    values = np.zeros(10)
+    before = content(values)
+    values[3] = 1.0
+    assert content(values) != before
+
+
+def test_the_latest_results_are_kept() -> None:
+    asked: list[int] = []
+
+    def double(value: int) -> int:
+        asked.append(value)
+        return 2 * value
+
+    kept = Kept[int](2)
+    assert [kept.of(double, value) for value in (1, 2, 1, 3, 1, 2)] == [2, 4, 2, 6, 2, 4]
+    assert asked == [1, 2, 3, 2]
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Session:
+    return session(sensors=Sensors(joint=0.05, motor=0.1))
+
+
+def changes(one: Session) -> list[Session]:
+    """The same recording with a little of it changed, one thing at a time."""
+    moved = one.joint.position.copy()
+    moved[100, 0] += 1e-9
+    return [
+        replace(one, joint=replace(one.joint, position=moved)),
+        replace(one, path=Path("other.mcap")),
+        replace(one, metadata={**one.metadata, "payload": "other"}),
+        replace(one, phases=one.phases[:-1]),
+        replace(one, motor=None),
+    ]
+
+
+def test_equal_recordings_are_screened_once_and_changed_ones_anew(
+    recorded: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+    monkeypatch.setattr(screening, "_screened", Kept(8))
+    monkeypatch.setattr(screening, "_doubts", lambda *rest, **options: (calls.append(1), ())[1])
+    arm = chain()
+    copy = replace(recorded, joint=replace(recorded.joint, effort=recorded.joint.effort.copy()))
+    for one in (recorded, copy):
+        screening.screen([one], arm)
+    assert len(calls) == 1
+    for number, one in enumerate(changes(recorded), start=2):
+        screening.screen([one], arm)
+        assert len(calls) == number
+    screening.screen([recorded], arm, SHORT)
+    screening.screen([recorded], replace(arm, gravity=np.array([0.1, 0.0, -9.8])))
+    assert len(calls) == 8
+
+
+def test_the_choice_of_equal_recordings_is_made_once_and_of_changed_ones_anew(
+    recorded: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+    arm: Chain = chain()
+
+    def chosen(*rest: Any, **options: Any) -> signal_choice.SignalChoice:
+        calls.append(1)
+        return signal_choice.SignalChoice(
+            SHORT, ModelStructure(arm, 2).coulomb, ModelStructure(arm, 2).coulomb
+        )
+
+    monkeypatch.setattr(signal_choice, "_choices", Kept(16))
+    monkeypatch.setattr(signal_choice, "_chosen", chosen)
+
+    def ask(one: Session, payload: str | None = None, model: int = 2, columns: int = 20) -> None:
+        structure = ModelStructure(arm, model)
+        choose_signals([one], [payload], structure, np.arange(columns), SignalSettings())
+
+    ask(recorded)
+    ask(recorded)
+    assert len(calls) == 1
+    for number, one in enumerate(changes(recorded), start=2):
+        ask(one)
+        assert len(calls) == number
+    ask(recorded, payload="load")
+    ask(recorded, model=1)
+    ask(recorded, columns=21)
+    assert len(calls) == 9
