@@ -9,6 +9,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
+from operator import attrgetter
 from typing import Any, Protocol
 
 import numpy as np
@@ -315,6 +317,28 @@ class System:
         if title not in _KEPT and (not isinstance(kept, dict) or (path and path[0] not in kept)):
             return kept if not path else 0
         return get(kept, path, title)
+
+    def reader(self, title: str, path: Path) -> Callable[[], Any]:
+        """``read`` of one place, as a function."""
+        if title not in _ARRAYS or not self._exists(title, path):
+            return partial(self.read, title, path)
+        number = self._place(title, path)
+        if title in ("$FRI_FRM_INT", "$FRI_TO_INT"):
+            numbers = attrgetter("to_int" if "_TO_" in title else "from_int")
+            return lambda: int(numbers(self.session)[number - 1])
+        return partial(self._element, title, number)
+
+    def writer(self, title: str, path: Path) -> Callable[[Any], None]:
+        """``write`` of one place, as a function."""
+        if title in _ARRAYS and self._exists(title, path):
+            return partial(self._write_element, title, self._place(title, path))
+        return partial(self.write, title, path)
+
+    @staticmethod
+    def _exists(title: str, path: Path) -> bool:
+        """Whether the array has this element."""
+        number = path[0] if path else None
+        return isinstance(number, int) and 1 <= number <= _ARRAYS[title]
 
     def _keep(self, title: str, path: Path) -> Any:
         """Content of a kept variable; an unknown one is made as its first use has it."""
