@@ -14,6 +14,7 @@ import math
 import struct
 from enum import Enum
 from math import hypot
+from typing import Any
 
 import numpy as np
 
@@ -257,6 +258,25 @@ class MsrBuffer:
         self.control = control
         self.error = error
         return None
+
+
+def leading(good: Any) -> int:
+    """Number of true values (n,) before the first false one."""
+    return len(good) if good.all() else int(np.argmin(good))
+
+
+def plausible(packets: np.ndarray) -> np.ndarray:
+    """Whether the joint values of `packets`, (n,) of `MSR`, are sure to pass ``MsrBuffer.fault``; (n,) bool.
+
+    Values at the very edge of what it passes are not sure.
+    """
+    # By the largest value instead of the norm; false for NaN.
+    places = np.concatenate(
+        [packets["msr_jnt_pos"], packets["cmd_jnt_pos"], packets["cmd_jnt_pos_fri_offset"]], axis=1
+    )
+    good: np.ndarray = np.abs(places).max(axis=1) < _MAX_POSITION_NORM / math.sqrt(3 * JOINTS)
+    good &= np.abs(packets["msr_jnt_trq"]).max(axis=1) < _MAX_TORQUE_NORM / math.sqrt(JOINTS)
+    return good
 
 
 class CmdBuffer:

@@ -152,6 +152,16 @@ class Ring:
         self._head[0] = published + 1
         return True
 
+    def publish_rows(self, rows: NDArray[Any]) -> None:
+        """As `publish` for each of the `rows`, (n,) of `ROW`, at most `free`."""
+        published, content = self._published, rows.view(np.uint8).data
+        first = min(len(rows), self.capacity - published % self.capacity)
+        at, size = published % self.capacity * ROW.itemsize, ROW.itemsize
+        self._bytes[at : at + first * size] = content[: first * size]
+        self._bytes[: (len(rows) - first) * size] = content[first * size :]
+        self._published = published + len(rows)
+        self._head[0] = self._published
+
     def beat(self, now_ns: int) -> None:
         """Sign of life of the writer, for each pass of the loop, also while no packet comes."""
         self._beat[0] = now_ns
