@@ -143,7 +143,7 @@ class CommandJudge:
         # Also false for NaN.
         good = (self._q_min <= q) & (q <= self._q_max)
         good &= (-np.array(self._steps) <= step) & (step <= self._steps)
-        return leading(good.all(axis=1))
+        return leading(good)
 
     def acceleration(self, change: np.ndarray, cycles: float) -> Objection | None:
         """The `change` (7,) [rad] of the step between two commands `cycles` apart within the limits.

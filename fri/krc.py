@@ -25,7 +25,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fri.judge import CommandJudge, Objection
-from fri.packets import CMD, CMD_ID, CMD_SIZE, JOINT_NAMES, JOINTS, MSR, CmdBuffer, Fault, leading, new_msr
+from fri.packets import (
+    CMD,
+    CMD_ID,
+    CMD_SIZE,
+    JOINT_NAMES,
+    JOINTS,
+    MSR,
+    MSR_OFFSETS,
+    CmdBuffer,
+    Fault,
+    leading,
+    new_msr,
+)
 from fri.policy import KrcLimits, KrcPolicy
 from fri.states import (
     ALL_DRIVES,
@@ -54,6 +66,8 @@ def _joints() -> np.ndarray:
     return np.zeros(JOINTS)
 
 
+#: Bytes of the reals and integers of KRL in a packet; its truth values follow.
+KRL = slice(MSR_OFFSETS["krl_real"], MSR_OFFSETS["krl_bool"])
 _JNTPOS = int(CommandFlag.JNTPOS)
 
 
@@ -247,6 +261,12 @@ class KrcSession:
     def from_bool(self) -> int:
         """``$FRI_FRM_BOOL`` as a mask, bit 0 is ``[1]``."""
         return self._command.krl_bool
+
+    @property
+    def variables(self) -> bytes:
+        """``$FRI_TO_REA``, ``$FRI_TO_INT`` and the mask `to_bool` as the next packet holds them, from `KRL` on."""
+        bits = self.to_bool & 0xFFFF
+        return bytes(self._bytes[KRL]) + bits.to_bytes(2, "little")
 
     @property
     def miss_counter(self) -> int:
@@ -633,7 +653,8 @@ class CyclesAhead:
     def __init__(self, session: KrcSession, commands: np.ndarray, targets: np.ndarray) -> None:
         self._session, self._commands, self._targets = session, commands, targets
         self._done = 0
-        self._krl, self._target = session._krl, session._track.target
+        self._krl, self._first = session._krl, session._track.target
+        self._target = self._first
         self.positions = session._track.lines(targets).reshape(len(targets), -1, JOINTS)
         self.packets = self._heads()
 
@@ -674,12 +695,15 @@ class CyclesAhead:
         session.cycle += count
         session._uptime_ms += count * session.sample_time_ms
         session._sequence = (session._sequence + count) & 0xFFFF
-        session._track.follow(self._targets[self._done : done])
-        self._target, self._done = session._track.target, done
+        before, self._target = self._targets[done - 2] if done > 1 else self._first, self._targets[done - 1]
+        session._track.follow(before, self._target)
+        self._done = done
 
     def finish(self) -> None:
         """Put the rest of the session behind the cycles placed."""
         session, done = self._session, self._done
+        if session.state is State.CMD:
+            session._track.accept(self._targets[:done])
         session._statistics.repeat(done)
         session._counts["answered"] += done
         session._dwell = session._dwell + done if session.quality >= session.policy.start_quality else 0

@@ -345,7 +345,7 @@ class KrlProgram:
         elif isinstance(statement, tree.Branch):
             choose = partial(self._chosen, statement, self._evaluator(statement.condition))
         elif isinstance(statement, tree.Switch):
-            choose = partial(self._case, statement)
+            choose = self._switch(statement)
         return _Step(statement.line, plain, act, choose, statement)
 
     def _assignment(self, statement: tree.Assign) -> Callable[[], str]:
@@ -356,6 +356,19 @@ class KrlProgram:
             return ""
 
         return act
+
+    def _switch(self, statement: tree.Switch) -> Callable[[], tuple[tree.Statement, ...]]:
+        subject = self._evaluator(statement.subject)
+        cases = [([self._evaluator(value) for value in values], block) for values, block in statement.cases]
+
+        def choose() -> tuple[tree.Statement, ...]:
+            chosen = subject()
+            for values, block in cases:
+                if any(value() == chosen for value in values):
+                    return block
+            return statement.default
+
+        return choose
 
     @staticmethod
     def _chosen(statement: tree.Branch, condition: Callable[[], Any]) -> tuple[tree.Statement, ...]:
@@ -419,7 +432,7 @@ class KrlProgram:
             chosen = statement.then if self._value(statement.condition) else statement.otherwise
             return self._run_at_once(chosen)
         elif isinstance(statement, tree.Switch):
-            return self._run_at_once(self._case(statement))
+            return self._run_at_once(self._switch(statement)())
         elif isinstance(statement, tree.Leave):
             if statement.value is not None:
                 self._frames[-1].result = copy.deepcopy(self._value(statement.value))
@@ -482,13 +495,6 @@ class KrlProgram:
             value += step
         self._write(statement.variable, value)
         return ""
-
-    def _case(self, statement: tree.Switch) -> tuple[tree.Statement, ...]:
-        subject = self._value(statement.subject)
-        for values, block in statement.cases:
-            if any(self._value(value) == subject for value in values):
-                return block
-        return statement.default
 
     def _loop(self, statement: tree.Loop | tree.Repeat) -> Flow:
         passes, until = 0, isinstance(statement, tree.Repeat)
@@ -620,14 +626,17 @@ class KrlProgram:
         if fixed is None:
             return partial(self._write, name)
         title, path = fixed
-        outside = self._system.writer(title, path)
+        frames, modules, outside = self._frames, self._globals, self._system.writer(title, path)
 
         def write(value: Any) -> None:
-            owner = self._owner(title)
-            if owner is None:
-                outside(value)
-            else:
-                owner[title] = put(owner[title], path, value, title)
+            frame = frames[-1]
+            owner = frame.values
+            if title not in owner:
+                owner = modules[frame.module]
+                if title not in owner:
+                    outside(value)
+                    return
+            owner[title] = put(owner[title], path, value, title)
 
         return write
 

@@ -317,8 +317,7 @@ class RemoteEnd:
         )
         for name in _STEADY:
             good &= packets[name] == msr.record[name]
-        good &= plausible(packets)
-        return leading(good)
+        return min(leading(good), plausible(packets))
 
     def take(self, packets: np.ndarray, commands: np.ndarray) -> None:
         """Take in recognised `packets`, (n,) of `MSR`, and their answers, (n,) of `CMD`, sent already."""

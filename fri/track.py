@@ -132,12 +132,15 @@ class SetpointTrack:
         positions[:, -1:] = ends
         return positions.reshape(-1, JOINTS)
 
-    def follow(self, commands: np.ndarray) -> None:
-        """As ``command`` for each of the commands (m, 7)."""
+    def follow(self, before: np.ndarray, q: np.ndarray) -> None:
+        """Be where ``command`` leads with q after `before`, (7,) each; `accept` completes it."""
+        self._previous, self.target, self._goal = before, q, q
+
+    def accept(self, commands: np.ndarray) -> None:
+        """The commands (m, 7) that were followed, all after the last one of ``command`` or ``accept``."""
         # Nothing of a command is left after the next two.
         for q in commands[-2:]:
             self._accept(q)
-            self._previous, self.target, self._goal = self.target, q, q
 
     def extrapolated(self) -> np.ndarray:
         """The setpoint one step further on, (7,)."""

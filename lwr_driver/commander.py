@@ -274,7 +274,7 @@ class Commander:
         """
         error, away = self._distances(values, q), self._distances(values, setpoints)
         limit = self._tracking_limit
-        return leading(~((error > limit) | (away > limit)).any(axis=1))
+        return leading(~((error > limit) | (away > limit)))
 
     def take_rows(self, values: NDArray[np.float32], q: NDArray[np.float32]) -> None:
         """The `values` of `rows_ahead`, (n, 7), have been sent; q : of the packets that they answer."""

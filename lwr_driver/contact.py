@@ -386,7 +386,9 @@ class ContactWatch:
         q, tau = self._filter[0, :JOINTS], self._filter[0, JOINTS:]
         qd = self._filter[1, :JOINTS]
         qdd = self._acceleration(q, qd, self._now[:JOINTS])
-        expected = self._bodies(q, qd, qdd, gravity)
+        expected = self._pin.rnea(self._model, self._data, q, qd, qdd)
+        if self._listens and gravity.any():
+            expected = expected + gravity - self._weight(q)
         if self._friction:
             friction, unsure = self._frictions(qd, qdd)
             expected = expected + friction
@@ -399,13 +401,15 @@ class ContactWatch:
         acceleration: Floats = self._square * (measured - q) - self._double * qd
         return acceleration
 
-    def _bodies(self, q: Floats, qd: Floats, qdd: Floats, gravity: Floats) -> Floats:
-        """Joint torque of the rigid bodies, (7,) each; gravity : of the packet."""
-        pin, model, data = self._pin, self._model, self._data
-        expected: Floats = pin.rnea(model, data, q, qd, qdd)
-        if not self._carried and gravity.any():
-            expected = expected + gravity - pin.computeGeneralizedGravity(model, data, q)
-        return expected
+    @property
+    def _listens(self) -> bool:
+        """Whether the packet's gravity torque tells the weight of the payload."""
+        return not self._carried
+
+    def _weight(self, q: Floats) -> Floats:
+        """Gravity torque of the expected bodies (7,)."""
+        weight: Floats = self._pin.computeGeneralizedGravity(self._model, self._data, q)
+        return weight
 
     def _frictions(self, qd: Floats, qdd: Floats) -> tuple[Floats, Floats]:
         """Friction with offset, and the share of it with an uncertain sign; (..., 7) each."""
@@ -466,7 +470,7 @@ class WatchAhead:
         same = self._packets[:, :JOINTS] == before[:, :JOINTS]
         repeated = same & (np.abs(step[:, :JOINTS]) > watch._slowest)
         odd = np.abs(change - step)
-        return leading((odd <= watch._jump).all(axis=1) & ~repeated.any(axis=1))
+        return min(leading(odd <= watch._jump), leading(~repeated))
 
     def _filter(self, before: Floats, change: Floats) -> None:
         """States of the low-pass after each packet, and its input: `ContactWatch._low_pass` for single cycles."""
@@ -489,8 +493,13 @@ class WatchAhead:
         qdd = watch._acceleration(q, qd, packets[:, :JOINTS])
         gravity = packets[:, 3 * JOINTS :]
         expected = np.empty_like(q)
-        for result, *rows in zip(expected, q, qd, qdd, gravity, strict=True):
-            result[:] = watch._bodies(*rows)
+        rnea, model, data = watch._pin.rnea, watch._model, watch._data
+        for result, *rows in zip(expected, q, qd, qdd, strict=True):
+            result[:] = rnea(model, data, *rows)
+        if watch._listens and gravity.any():
+            weight = np.array([watch._weight(row).copy() for row in q])
+            given = np.any(gravity, axis=1, keepdims=True)
+            expected = np.where(given, expected + gravity - weight, expected)
         self._open, self._allowed = (
             np.tile(watch._open, (self.count, 1)),
             np.tile(watch.allowed, (self.count, 1)),
@@ -509,7 +518,7 @@ class WatchAhead:
         torques = np.abs(self._packets[: self.count, JOINTS : 3 * JOINTS])
         good = (torques[:, :JOINTS] - self._watch._most <= 0.0) & (torques[:, JOINTS:] - self._allowed <= 0.0)
         good &= np.abs(self._external) - self._allowed <= 0.0
-        return leading(good.all(axis=1))
+        return leading(good)
 
     def place(self, done: int) -> None:
         """Take the first `done` packets."""

@@ -154,7 +154,7 @@ class Guard:
         excess -= self._bounds
         excess -= np.array([[ROUNDING], [v_error], [a_error], [j_error]])
         # Also false for NaN.
-        return leading((excess <= _SLACK).all(axis=(1, 2)))
+        return leading(excess <= _SLACK)
 
     def remember_rows(self, q: NDArray[np.float32]) -> None:
         """Rows of q (n, 7) that have passed `check_rows` are sent."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from fri.handshake import IdentificationHandshake, find_handshake
 from fri.in_process import Network
-from fri.packets import CMD
+from fri.packets import CMD, raw
 from fri.remote import LinkEvent, RemoteEnd
 from fri.states import ALL_DRIVES, Quality, State
 from fri.states import Control as ControlMode
@@ -821,14 +821,16 @@ class Loop:
         rows["t_recv"] = rows["t_send"] = rows["sequence"] * round(self._period * 1e9)
         rows["plan_index"], rows["phase"] = index + count, self._commander.phase
         rows["answered"] = 1
-        rows["msr"], rows["cmd"] = packets, commands
+        content = raw(rows)
+        content[:, self._msr_place], content[:, self._cmd_place] = raw(packets), raw(commands)
         if self._ring is not None:
             self._ring.publish_rows(rows)
             self._ring.beat(time.monotonic_ns())
+        history = raw(control.history)
         for start in range(0, len(rows), HISTORY_STEP):
-            some = rows[start : start + HISTORY_STEP]
+            some = content[start : start + HISTORY_STEP]
             cycles = int(words[Word.CYCLES])
-            control.history[(cycles + np.arange(len(some))) % HISTORY] = some
+            history[(cycles + np.arange(len(some))) % HISTORY] = some
             words[Word.CYCLES] = cycles + len(some)
         words[Word.MODE] = int(self._commander.mode)
         words[Word.INDEX] = words[Word.ROW] = self._commander.index

@@ -13,8 +13,8 @@ import numpy as np
 import pinocchio as pin
 from numba import njit
 
-from fri.krc import CyclesAhead
-from fri.packets import MSR
+from fri.krc import KRL, CyclesAhead
+from fri.packets import MSR, raw
 from sim_backend.cabinet import Cabinet
 from sim_backend.controller import differences, externals, feedback
 from sim_backend.monitor import CommandMonitor
@@ -245,17 +245,23 @@ class CabinetAhead:
     def take(self, most: int) -> int:
         """Let up to `most` of the cycles pass; returns how many have passed."""
         cabinet, period_ms = self._cabinet, self._period_ms
-        bodies, start, going_on = cabinet.model.model, cabinet.cycle, True
-        variables: list[tuple[int, np.ndarray, np.ndarray, int]] = []
+        bodies, interpreter, start = cabinet.model.model, cabinet.interpreter, cabinet.cycle
+        going_on = True
+        session, variables, starts = cabinet.session, [], []
         done = 0
         while done < most and going_on:
-            session = cabinet.session
-            variables.append((done, session.to_real.copy(), session.to_int.copy(), session.to_bool & 0xFFFF))
+            starts.append(done)
+            variables.append(session.variables)
             idle = min(cabinet.idle_cycles(period_ms), most - done - 1)
             done += idle + 1
             self._pass(idle, done)
-            going_on = self._session.going_on and cabinet.ordinary and cabinet.model.model is bodies
-        self._write(variables, done)
+            going_on = (
+                self._session.going_on
+                and cabinet.model.model is bodies
+                and cabinet.interpreter is interpreter
+                and not (interpreter is not None and interpreter.moving)
+            )
+        self._write(variables, np.diff([*starts, done]))
         self._session.finish()
         self._arm.place(done * period_ms)
         self._model.place(done)
@@ -274,13 +280,11 @@ class CabinetAhead:
         cabinet.publish(cabinet.reading.motor_torque)
         cabinet.pass_cycles(idle + 1, period_ms)
 
-    def _write(self, variables: list[tuple[int, np.ndarray, np.ndarray, int]], done: int) -> None:
-        """Write the KRL variables into the packets: as they were from the packet of each number on."""
-        starts, reals, integers, bits = zip(*variables, strict=True)
-        lengths = np.diff([*starts, done])
-        packets = self.packets[:done]
-        for name, values in (("krl_real", reals), ("krl_int", integers), ("krl_bool", bits)):
-            packets[name] = np.repeat(np.array(values), lengths, axis=0)
+    def _write(self, variables: list[bytes], lengths: np.ndarray) -> None:
+        """Write the KRL variables into the packets: each of `variables` into so many of them."""
+        values = np.frombuffer(b"".join(variables), np.uint8).reshape(len(variables), -1)
+        content = raw(self.packets)[: lengths.sum()]
+        content[:, KRL.start : KRL.start + values.shape[1]] = np.repeat(values, lengths, axis=0)
 
 
 def prepare(cabinet: Cabinet) -> None:

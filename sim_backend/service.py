@@ -36,7 +36,7 @@ _TURN_S = 0.0005  # pause between the turns of an idle loop
 _PERHAPS_S = 0.02
 _PACED_AFTER = 2000
 _PENDANT_EVERY = 50
-_MANY = 200  # most cycles at once: the pendant and requests of the driver wait for so long
+_MANY = 250  # most cycles at once: the pendant and requests of the driver wait for so long
 _NO_COMMANDS = np.zeros(0, CMD)
 
 
