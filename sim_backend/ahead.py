@@ -10,19 +10,19 @@ the variables of the interface, the cycles end with it.
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 from numba import njit
 
 from fri.krc import KRL, CyclesAhead
 from fri.packets import MSR, raw
+from sim_backend import bodies
 from sim_backend.cabinet import Cabinet
-from sim_backend.controller import differences, externals, feedback
+from sim_backend.controller import differences, externals, feedback, poses
 from sim_backend.monitor import CommandMonitor
 from sim_backend.plant import CYCLE_S, ElasticArm, predict
 from sim_backend.sensors import read, read_motor
 from sim_backend.stiction import advance
 
-# Rows of the arm's state, (27, n): the plant's state, torques and last velocity, the controller's memory, the sensors,
+# Rows of the arm's state, (19, n): the plant's state, torques and last velocity, the controller's memory, the sensors,
 # the controller's torque, the point in the middle of the cycle, and energy with the number of descents.
 _STATE, _TORQUE, _MOTOR, _BEFORE, _MEMORY, _READING = slice(0, 4), 4, 5, 6, slice(7, 11), slice(11, 15)
 _COMMAND, _MIDDLE, _ENERGY = 15, slice(16, 18), 18
@@ -30,37 +30,40 @@ _ROWS, _DESCENTS = 19, 3
 
 
 @njit(cache=True)
-def _begin(number, work, table, drive, settings):  # type: ignore[no-untyped-def]
-    """Beginning of a millisecond: sensors, controller, middle of the cycle.
+def _millisecond(work, modes, now, arm, controller, table, settings, gravity, mass, bias):  # type: ignore[no-untyped-def]
+    """A millisecond, as by `Cabinet`: sensors, controller, motion of the joints.
 
-    work : rows as above. table : gains of the controller (7 rows), settings of the sensors (8), inertia, stiffness and
-    damping of the joints (3), friction (6). drive : for each millisecond, noise (3 rows), setpoint, gravity torque
-    settings : the controller's four, half a cycle and a cycle [s], substeps, whether the sensors are on the link side
+    work, modes : the state, see above. now : noise (3 rows), setpoint. arm, controller : chains of bodies
+    table : gains of the controller (7 rows), settings of the sensors (8), inertia, stiffness and damping of the joints
+    (3), friction (6). settings : the controller's four, cycle [s], substeps, whether the sensors are on the link side
+    gravity, mass, bias : room for the bodies' torques and mass matrix
     """
-    now = drive[number]
-    reading = work[11:15]
-    position = work[2] if settings[7] > 0.0 else work[0]
+    reading, middle, cycle = work[11:15], work[16:18], settings[4]
+    position = work[2] if settings[6] > 0.0 else work[0]
     read(position, work[0], work[4], table[7:15], now[0:3], reading)
-    feedback(now[3], now[4], reading[1], reading[2], table[0:7], work[7:11], settings[0:4], work[15])
+    bias[:] = 0.0
+    bodies.torques(controller, now[3], bias, gravity)
+    feedback(now[3], gravity, reading[1], reading[2], table[0:7], work[7:11], settings[0:4], work[15])
     read_motor(work[5], work[15], table[7:15], now[0:3], reading)
     work[5, :] = work[15]
-    predict(work[2], work[3], work[6], settings[4], work[16:18])
+    predict(work[2], work[3], work[6], 0.5 * cycle, middle)
+    bodies.mass_matrix(arm, middle[0], mass)
+    bodies.torques(arm, middle[0], middle[1], bias)
+    joint, friction, substeps = table[15:18], table[18:24], int(settings[5])
+    work[18, 3] += advance(
+        work[0:4], modes, mass, bias, work[5], joint, friction, cycle, substeps, work[4], work[18]
+    )
 
 
 @njit(cache=True)
-def _step(number, mass, bias, work, modes, table, drive, settings, past, past_modes):  # type: ignore[no-untyped-def]
-    """End of a millisecond, the motion of the joints, and beginning of the next, if there is one.
-
-    past, past_modes : keep the state at its end
-    """
-    joint, friction, substeps = table[15:18], table[18:24], int(settings[6])
-    work[18, 3] += advance(
-        work[0:4], modes, mass, bias, work[5], joint, friction, settings[5], substeps, work[4], work[18]
-    )
-    past[number] = work
-    past_modes[number] = modes
-    if number + 1 < drive.shape[0]:
-        _begin(number + 1, work, table, drive, settings)
+def _run(work, modes, drive, arm, controller, table, settings, gravities, past, past_modes):  # type: ignore[no-untyped-def]
+    """Milliseconds in turn; `past`, `past_modes` keep the state after each, `gravities` its gravity torque."""
+    n = work.shape[1]
+    mass, bias = np.empty((n, n)), np.empty(n)
+    for k in range(drive.shape[0]):
+        _millisecond(work, modes, drive[k], arm, controller, table, settings, gravities[k], mass, bias)
+        past[k] = work
+        past_modes[k] = modes
 
 
 class ArmAhead:
@@ -71,24 +74,14 @@ class ArmAhead:
         assert isinstance(plant, ElasticArm)
         self._cabinet, self._plant = cabinet, plant
         count, n = setpoints.shape
-        model = cabinet.model
-        self.gravity = np.empty((count, n))
-        for result, setpoint in zip(self.gravity, setpoints, strict=True):
-            result[:] = pin.computeGeneralizedGravity(model.model, model.data, setpoint)
-        self.past = np.empty((count, _ROWS, n))
+        self.gravity, self.past = np.empty((count, n)), np.empty((count, _ROWS, n))
         self.past_modes = np.empty((count, 2, n), dtype=np.int64)
-        drive = np.empty((count, 5, n))
-        drive[:, :3], drive[:, 3], drive[:, 4] = cabinet.sensors.noise(count), setpoints, self.gravity
+        drive = np.concatenate([cabinet.sensors.noise(count), setpoints[:, np.newaxis]], axis=1)
         table = np.concatenate([controller.gains, cabinet.sensors.settings, plant.joint, plant.friction])
-        cycle, link_side = plant.cycle_s, float(cabinet.sensors.link_side)
-        settings = np.array([*controller.settings, 0.5 * cycle, cycle, plant.substeps, link_side])
-        work, modes = self._work(), plant.modes.copy()
-        _begin(0, work, table, drive, settings)
-        crba, bias, bodies, data = pin.crba, pin.nonLinearEffects, plant.model, plant.data
-        middle, speed = work[_MIDDLE]
-        fixed = work, modes, table, drive, settings, self.past, self.past_modes
-        for number in range(count):
-            _step(number, crba(bodies, data, middle), bias(bodies, data, middle, speed), *fixed)
+        link_side = float(cabinet.sensors.link_side)
+        settings = np.array([*controller.settings, plant.cycle_s, plant.substeps, link_side])
+        chains, kept = (plant.chain, cabinet.model.chain), (self.past, self.past_modes)
+        _run(self._work(), plant.modes.copy(), drive, *chains, table, settings, self.gravity, *kept)
 
     def _work(self) -> np.ndarray:
         plant, work = self._plant, np.zeros((_ROWS, self._plant.position.size))
@@ -156,10 +149,9 @@ class ModelAhead:
         packets, model = self._packets, self._cabinet.model
         packets["msr_jnt_pos"], packets["msr_jnt_trq"] = self._position[:-1], self._torque[:-1]
         packets["gravity"] = _after(model.gravity, self._gravity[:-1])
-        poses = np.empty((len(packets), 12))
-        for pose, position in zip(poses, self._position, strict=False):
-            model.flange(position, pose)
-        packets["msr_cart_pos"] = poses
+        places = np.empty((len(packets), 12))
+        poses(model.chain, self._position[:-1], places)
+        packets["msr_cart_pos"] = places
 
     def _renew(self) -> None:
         """Mass matrix, Jacobian and pose of the setpoint, renewed as by `Cabinet.packet`."""
@@ -195,12 +187,9 @@ class ModelAhead:
         keep = model.keep(period_s)
         self._memory = np.empty((len(packets), *model.memory.shape))
         differences(positions, period_s, keep, model.memory.copy(), self._memory)
-        bias, self._external = np.empty_like(positions), np.empty_like(positions)
-        effects, bodies, data = pin.nonLinearEffects, model.model, model.data
-        for result, position, speed in zip(bias, positions, self._memory[:, 1], strict=True):
-            result[:] = effects(bodies, data, position, speed)
-        estimate = model.external_torque.copy()
-        externals(self._torque[1:], bias, self._masses, self._memory, keep, estimate, self._external)
+        self._external, estimate = np.empty_like(positions), model.external_torque.copy()
+        torques, masses = self._torque[1:], self._masses
+        externals(model.chain, positions, torques, masses, self._memory, keep, estimate, self._external)
         packets["est_ext_jnt_trq"] = _after(model.external_torque, self._external[:-1])
 
     def place(self, done: int) -> None:

@@ -142,6 +142,7 @@ class Cabinet:
     def _compile(self, scratch: ControllerModel) -> None:
         """Compile on the first run of a computer, before the PC waits for an answer."""
         scratch.update_model(self.reading.position)
+        scratch.flange(self.reading.position, np.empty(12))
         scratch.update_external(self.reading.position, self.reading.joint_torque, CYCLE_S)
         spring = PositionController(self.config.controller)
         spring.spring_cycle(self._zero, self._zero, self._zero, self._zero, self._zero)

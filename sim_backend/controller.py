@@ -26,6 +26,8 @@ import numpy as np
 import pinocchio as pin
 from numba import njit
 
+from fri.errors import ConfigurationError
+from sim_backend import bodies
 from sim_backend.configuration import ControllerConfig, LoadData
 from sim_backend.plant import CYCLE_S
 from sim_backend.robot import Payload, with_payload
@@ -115,11 +117,20 @@ def differences(positions, period, keep, memory, memories):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def externals(joint_torques, biases, masses, memories, keep, estimate, estimates):  # type: ignore[no-untyped-def]
+def externals(chain, positions, joint_torques, masses, memories, keep, estimate, estimates):  # type: ignore[no-untyped-def]
     """`external` for successive cycles; `estimates` (m, n) keeps the estimate after each."""
+    bias = np.empty(estimate.shape[0])
     for k in range(joint_torques.shape[0]):
-        external(joint_torques[k], biases[k], masses[k], memories[k, 2], keep, estimate)
+        bodies.torques(chain, positions[k], memories[k, 1], bias)
+        external(joint_torques[k], bias, masses[k], memories[k, 2], keep, estimate)
         estimates[k] = estimate
+
+
+@njit(cache=True)
+def poses(chain, positions, out):  # type: ignore[no-untyped-def]
+    """Poses of the flange (m, 12) at positions (m, n)."""
+    for k in range(positions.shape[0]):
+        bodies.pose(chain, positions[k], out[k])
 
 
 def _keep(cutoff_hz: float, period_s: float = CYCLE_S) -> float:
@@ -240,7 +251,7 @@ class ControllerModel:
         self._bare = model
         self._frame = model.getFrameId(flange) if model.existFrame(flange) else model.nframes - 1
         n = model.nv
-        self.gravity = np.zeros(n)
+        self.gravity, self._rest = np.zeros(n), np.zeros(n)
         self.mass_matrix = np.zeros((n, n))
         self.jacobian = np.zeros((6, n))
         self.external_torque = np.zeros(n)
@@ -261,11 +272,18 @@ class ControllerModel:
         self.load = load
         body = Payload.from_centre_of_mass(load.mass, load.com, load.inertia) if load.mass > 0.0 else None
         self.model = with_payload(self._bare, body)
-        self.data = self.model.createData()
+        self._data = self.model.createData()
+        frame = self.model.frames[self._frame]
+        if frame.parentJoint != self.model.njoints - 1:
+            raise ConfigurationError(
+                f"frame {frame.name!r} of the controller's model is not on the last link"
+            )
+        self.chain = bodies.chain_of(self.model, frame.placement)
 
     def update_gravity(self, position: np.ndarray) -> np.ndarray:
         """Gravity torque at `position` (n,) [Nm]; a new array."""
-        self.gravity = pin.computeGeneralizedGravity(self.model, self.data, position)
+        self.gravity = np.empty(self.gravity.size)
+        bodies.torques(self.chain, position, self._rest, self.gravity)
         return self.gravity
 
     def update_model(self, position: np.ndarray) -> None:
@@ -274,9 +292,9 @@ class ControllerModel:
 
     def model_at(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same without keeping them."""
-        mass_matrix = pin.crba(self.model, self.data, position).copy(order="K")
+        mass_matrix = pin.crba(self.model, self._data, position).copy(order="K")
         jacobian = pin.computeFrameJacobian(
-            self.model, self.data, position, self._frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+            self.model, self._data, position, self._frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         )
         return mass_matrix, np.concatenate([jacobian[:3], jacobian[:2:-1]])
 
@@ -291,11 +309,10 @@ class ControllerModel:
             self._begun = True
         keep, memory = self.keep(period_s), self.memory
         difference(position, period_s, keep, memory)
-        bias = pin.nonLinearEffects(self.model, self.data, position, memory[1])
+        bias = np.empty(position.size)
+        bodies.torques(self.chain, position, memory[1], bias)
         external(joint_torque, bias, self.mass_matrix, memory[2], keep, self.external_torque)
 
     def flange(self, position: np.ndarray, out: np.ndarray) -> None:
         """Pose of the flange in the base frame into `out` (12,), 3x4 row-major [R | p]."""
-        pin.forwardKinematics(self.model, self.data, position)
-        pose = pin.updateFramePlacement(self.model, self.data, self._frame)
-        out[:] = pose.homogeneous[:3].reshape(12)
+        bodies.pose(self.chain, position, out)

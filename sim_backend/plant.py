@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numba import njit
 
+from sim_backend import bodies
 from sim_backend.robot import Drive, Payload, with_payload
 from sim_backend.stiction import advance
 
@@ -113,7 +114,7 @@ def predict(position, velocity, before, half, middle):  # type: ignore[no-untype
 
 
 class ElasticArm:
-    """Two masses per joint (see `stiction`), rigid links and payload by pinocchio.
+    """Two masses per joint (see `stiction`), rigid links and payload (see `bodies`).
 
     The mass matrix and the gravity, centrifugal and Coriolis torques are evaluated once per cycle, at its
     extrapolated midpoint; the joints advance in `substeps` steps within the cycle.
@@ -153,6 +154,7 @@ class ElasticArm:
         self.pushed = False
         self.last_velocity = np.zeros(n)
         self._middle = np.zeros((2, n))
+        self._mass, self._bias = np.zeros((n, n)), np.zeros(n)
         self.loads = Loads(np.zeros(n), np.zeros(n), *self.friction)
         streams = (random or np.random.SeedSequence(0)).spawn(len(self.effects))
         for effect, stream in zip(self.effects, streams, strict=True):
@@ -162,7 +164,8 @@ class ElasticArm:
 
     def _use(self, model: pin.Model) -> None:
         self.model = model
-        self.data = model.createData()
+        self._data = model.createData()
+        self.chain = bodies.chain_of(model)
 
     def reset(self, position: np.ndarray) -> None:
         """Links at rest at `position` (n,), with gravity and offset carried by the torsion of the joints."""
@@ -170,7 +173,7 @@ class ElasticArm:
         self.velocity[:] = 0.0
         self.motor_velocity[:] = 0.0
         self.last_velocity[:] = 0.0
-        load = pin.computeGeneralizedGravity(self.model, self.data, self.position) + self._nominal[5]
+        load = pin.computeGeneralizedGravity(self.model, self._data, self.position) + self._nominal[5]
         load -= self._push
         self.motor_position[:] = self.position + load / self.joint[1]
         self.modes[:] = 0
@@ -184,7 +187,7 @@ class ElasticArm:
         self.motor_velocity[:] = 0.0
         self.last_velocity[:] = 0.0
         for _ in range(50):
-            load = pin.computeGeneralizedGravity(self.model, self.data, self.position) + self._nominal[5]
+            load = pin.computeGeneralizedGravity(self.model, self._data, self.position) + self._nominal[5]
             self.position[:] = self.motor_position - (load - self._push) / self.joint[1]
         self.joint_torque[:] = self.joint[1] * (self.motor_position - self.position)
 
@@ -203,8 +206,9 @@ class ElasticArm:
         self.motor_torque[:] = motor_torque
         middle, middle_velocity = self._middle
         predict(self.position, self.velocity, self.last_velocity, 0.5 * self.cycle_s, self._middle)
-        mass = pin.crba(self.model, self.data, middle)
-        bias = pin.nonLinearEffects(self.model, self.data, middle, middle_velocity)
+        mass, bias = self._mass, self._bias
+        bodies.mass_matrix(self.chain, middle, mass)
+        bodies.torques(self.chain, middle, middle_velocity, bias)
         drive_torque = self.motor_torque
         if self.effects or self.pushed:
             loads = self.loads
