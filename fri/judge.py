@@ -10,7 +10,7 @@ from math import isfinite
 
 import numpy as np
 
-from fri.packets import JOINT_NAMES, JOINTS, CmdBuffer
+from fri.packets import JOINT_NAMES, JOINTS, CmdBuffer, leading
 from fri.policy import KrcLimits, KrcPolicy
 from fri.states import ALLOWED_FLAGS, CommandFlag, Control, EventKind
 
@@ -133,6 +133,17 @@ class CommandJudge:
                     f"rad/s exceeds {steps[joint] / self._period:.4f} rad/s ({self._reason})",
                 )
         return None
+
+    def pass_rows(self, q: np.ndarray, target: np.ndarray) -> int:
+        """How many leading rows of q (n, 7) pass ``position`` and ``velocity``, one commanded after the other.
+
+        target : (7,) setpoint before the first row
+        """
+        step = q - np.concatenate([target[np.newaxis], q[:-1]])
+        # Also false for NaN.
+        good = (self._q_min <= q) & (q <= self._q_max)
+        good &= (-np.array(self._steps) <= step) & (step <= self._steps)
+        return leading(good)
 
     def acceleration(self, change: np.ndarray, cycles: float) -> Objection | None:
         """The `change` (7,) [rad] of the step between two commands `cycles` apart within the limits.

@@ -25,7 +25,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fri.judge import CommandJudge, Objection
-from fri.packets import CMD, JOINT_NAMES, JOINTS, CmdBuffer, Fault, new_msr
+from fri.packets import (
+    CMD,
+    CMD_ID,
+    CMD_SIZE,
+    JOINT_NAMES,
+    JOINTS,
+    MSR,
+    MSR_OFFSETS,
+    CmdBuffer,
+    Fault,
+    leading,
+    new_msr,
+)
 from fri.policy import KrcLimits, KrcPolicy
 from fri.states import (
     ALL_DRIVES,
@@ -54,6 +66,8 @@ def _joints() -> np.ndarray:
     return np.zeros(JOINTS)
 
 
+#: Bytes of the reals and integers of KRL in a packet; its truth values follow.
+KRL = slice(MSR_OFFSETS["krl_real"], MSR_OFFSETS["krl_bool"])
 _JNTPOS = int(CommandFlag.JNTPOS)
 
 
@@ -249,6 +263,12 @@ class KrcSession:
         return self._command.krl_bool
 
     @property
+    def variables(self) -> bytes:
+        """``$FRI_TO_REA``, ``$FRI_TO_INT`` and the mask `to_bool` as the next packet holds them, from `KRL` on."""
+        bits = self.to_bool & 0xFFFF
+        return bytes(self._bytes[KRL]) + bits.to_bytes(2, "little")
+
+    @property
     def miss_counter(self) -> int:
         """Missing answers since the session was opened."""
         return self._statistics.miss_counter
@@ -395,9 +415,17 @@ class KrcSession:
         self._open = True
         self.answered = False
         self._fault = None
-        statistics = self._statistics
-        period = self.sample_time_ms * 1e-3
         buffer = self._bytes
+        self._stamp(buffer)
+        for name, view in self._views.items():
+            view[...] = getattr(sample, name)
+        self._cmd_jnt_pos[:] = self._krl
+        np.subtract(self._track.target, self._krl, out=self._offset, casting="same_kind")
+        return bytes(buffer)
+
+    def _stamp(self, buffer: memoryview | bytearray) -> None:
+        """Write counters, state, clock and statistics into a packet."""
+        statistics, period = self._statistics, self.sample_time_ms * 1e-3
         self._head(buffer, 0, self._sequence, self._reflected)
         self._bools(buffer, 136, self.to_bool & 0xFFFF)
         self._intf(
@@ -419,11 +447,6 @@ class KrcSession:
             self.error,
             self.warning,
         )
-        for name, view in self._views.items():
-            view[...] = getattr(sample, name)
-        self._cmd_jnt_pos[:] = self._krl
-        np.subtract(self._track.target, self._krl, out=self._offset, casting="same_kind")
-        return bytes(buffer)
 
     def receive(self, datagram: bytes | bytearray | memoryview, delay_s: float = 0.0) -> bool:
         """Take in a datagram `delay_s` after the packet; True if it is this cycle's answer.
@@ -454,6 +477,47 @@ class KrcSession:
         self._delay_ns = delay_ns
         self._incoming, self._command = self._command, incoming
         return True
+
+    def ahead(self, commands: np.ndarray, delay_s: float) -> CyclesAhead | None:
+        """The coming cycles worked out beforehand, if they are ordinary ones; nothing changes yet.
+
+        commands : (n,) of `CMD`, the answers to the coming packets, each `delay_s` [s] after its packet
+
+        Ordinary are cycles of command mode in position control, answered so regularly that only clock, counters and
+        setpoint change. None if the first is none; the result ends before the first command that is objected to.
+        """
+        if not self._ordinary(delay_s) or not len(commands):
+            return None
+        head = commands[0]
+        count = np.arange(len(commands))
+        fits = (
+            (commands["packet_size"] == CMD_SIZE)
+            & (commands["datagram_id"] == CMD_ID)
+            & (commands["refl_seq"] == (self._sequence + 1 + count) & 0xFFFF)
+            & (commands["cmd_flags"] == head["cmd_flags"])
+            & (commands["krl_bool"] == head["krl_bool"])
+            & (commands["krl_int"] == head["krl_int"]).all(axis=1)
+            & (commands["krl_real"] == head["krl_real"]).all(axis=1)
+        )
+        flags = int(head["cmd_flags"])
+        if flags != _JNTPOS or self._monitor_flags not in (None, flags):
+            return None
+        targets = commands["jnt_pos"].astype(np.float64)
+        most = min(leading(fits), self._judge.pass_rows(targets, self._track.target))
+        return CyclesAhead(self, commands[:most], targets[:most]) if most else None
+
+    def _ordinary(self, delay_s: float) -> bool:
+        """Whether a cycle with a valid answer after `delay_s` changes only clock, counters and setpoint."""
+        track, policy = self._track, self.policy
+        if self.state is not State.CMD or self._open or self._fault is not None or self._first_command:
+            return False
+        if self.control is not Control.POSITION or not self.power or track.ramping or track.missed:
+            return False
+        if policy.acceleration_factor is not None or self._drop is not None:
+            return False
+        if not self._statistics.steady(round(delay_s * 1e9)):
+            return False
+        return self.quality == self._rated() and self.quality >= policy.hold_quality
 
     def close_cycle(self) -> Setpoint:
         """End the cycle: judge the answer and give the setpoints of the next period.
@@ -492,12 +556,15 @@ class KrcSession:
         self._judge.tighten(self.sample_time_s, self._safety_limits, self._t1)
 
     def _rate(self) -> None:
+        self.quality = self._rated()
+        self._dwell = self._dwell + 1 if self.quality >= self.policy.start_quality else 0
+
+    def _rated(self) -> Quality:
         statistics = self._statistics
         quality = classify(
             statistics.packets, statistics.answer_rate, statistics.latency, self.sample_time_s, self.policy
         )
-        self.quality = min(quality, self.quality_ceiling)
-        self._dwell = self._dwell + 1 if self.quality >= self.policy.start_quality else 0
+        return min(quality, self.quality_ceiling)
 
     def _try_start(self) -> None:
         if self._dwell < self.policy.start_dwell or self._track.ramping:
@@ -574,6 +641,74 @@ class KrcSession:
                 objection = judge.acceleration(*self._track.change_of_step(target))
         self._first_command = False
         return target, objection
+
+
+class CyclesAhead:
+    """Ordinary cycles of a session, see ``KrcSession.ahead``; `place` takes them.
+
+    positions : (n, k, 7) [rad], setpoints of each period, a row for each millisecond, as of `Setpoint`
+    packets : (n,) of `MSR`, the packets but for the measurements and the KRL variables
+    """
+
+    def __init__(self, session: KrcSession, commands: np.ndarray, targets: np.ndarray) -> None:
+        self._session, self._commands, self._targets = session, commands, targets
+        self._done = 0
+        self._krl, self._first = session._krl, session._track.target
+        self._target = self._first
+        self.positions = session._track.lines(targets).reshape(len(targets), -1, JOINTS)
+        self.packets = self._heads()
+
+    def _heads(self) -> np.ndarray:
+        session, commands, before = self._session, self._commands, self._targets[:-1]
+        count = np.arange(1, len(commands) + 1)
+        first = bytearray(session._bytes)
+        session._stamp(first)
+        packets = np.repeat(np.frombuffer(first, MSR, 1), len(count))
+        packets["send_seq"] = (session._sequence + count) & 0xFFFF
+        packets["refl_seq"][:1] = session._reflected
+        packets["refl_seq"][1:] = commands["send_seq"][:-1]
+        packets["timestamp"] = (session._uptime_ms + session.sample_time_ms * count) * 1e-3
+        packets["cmd_jnt_pos"] = session._krl
+        offset = packets["cmd_jnt_pos_fri_offset"]
+        offset[0], offset[1:] = session._track.target - session._krl, before - session._krl
+        return packets
+
+    @property
+    def going_on(self) -> bool:
+        """Whether the cycles placed so far have left the session in command mode, with the setpoint of the last."""
+        session = self._session
+        return (
+            session.state is State.CMD
+            and session.control is Control.POSITION
+            and session._krl is self._krl
+            and session._drop is None
+            and session._track.target is self._target
+        )
+
+    def place(self, done: int) -> None:
+        """Put the session behind the first `done` cycles, as far as KRL can see and change it; never back."""
+        session, count = self._session, done - self._done
+        if not self._done:
+            # What KRL reads is the same in all.
+            session._command.load(self._commands[0].tobytes())
+            session.answered = True
+        session.cycle += count
+        session._uptime_ms += count * session.sample_time_ms
+        session._sequence = (session._sequence + count) & 0xFFFF
+        before, self._target = self._targets[done - 2] if done > 1 else self._first, self._targets[done - 1]
+        session._track.follow(before, self._target)
+        self._done = done
+
+    def finish(self) -> None:
+        """Put the rest of the session behind the cycles placed."""
+        session, done = self._session, self._done
+        if session.state is State.CMD:
+            session._track.accept(self._targets[:done])
+        session._statistics.repeat(done)
+        session._counts["answered"] += done
+        session._dwell = session._dwell + done if session.quality >= session.policy.start_quality else 0
+        session._command.load(self._commands[done - 1].tobytes())
+        session._reflected = session._command.send_seq
 
 
 def _as_sent(q: ArrayLike) -> np.ndarray:

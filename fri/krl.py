@@ -12,7 +12,8 @@ import copy
 import math
 import operator
 from collections.abc import Callable, Generator, Mapping
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,6 +40,9 @@ from fri.states import Control, State
 #: Interpolation cycle of the controller: a wait ends at its ticks [ms].
 TICK_MS = 12
 
+# A statement due so soon runs now [ms].
+_DUE_MS = 1e-6
+_LONG = 10**6
 _LONGEST_RUN = 2000
 _DEEPEST = 100
 _SPEED_SHARE = 0.25
@@ -88,6 +92,25 @@ class _Motion:
             if s == 1.0
             else self.start + s**3 * (10 - 15 * s + 6 * s * s) * (self.goal - self.start)
         )
+
+
+class _Step(NamedTuple):
+    """A statement prepared.
+
+    plain : takes no time and never waits. act : does it at once, for one that runs no others; choose : the block to run
+    """
+
+    line: int
+    plain: bool
+    act: Callable[[], str] | None
+    choose: Callable[[], tuple[tree.Statement, ...]] | None
+    statement: tree.Statement
+
+
+def _quotient(left: Any, right: Any) -> Any:
+    """KRL divides whole numbers without remainder."""
+    whole = isinstance(left, int) and isinstance(right, int)
+    return int(left / right) if whole else left / right
 
 
 class _Frame:
@@ -140,12 +163,16 @@ class KrlProgram:
         self.remarks: tuple[str, ...] = tuple(check.remarks)
         self._statement_ms, self._halt_s = statement_ms, halt_s
         self._system = System(self.machinery)
-        self._clock = self._due = self._owed = 0.0
+        self._clock = self._due = self._owed = self._now_ms = 0.0
         self._ticks = 0
         self._nested = 0
         self._line = 0
-        # Statements that never wait, and places of variables without indices, by their identity.
+        # By identity: prepared blocks and expressions, statements that never wait or run no others, and places of
+        # variables without indices.
+        self._prepared: dict[int, list[_Step]] = {}
+        self._evaluators: dict[int, Callable[[], Any]] = {}
         self._plain: dict[int, bool] = {}
+        self._single: dict[int, bool] = {}
         self._places: dict[int, tuple[str, Path]] = {}
         self._flow: Wait | None = None
         self._motion: _Motion | None = None
@@ -153,11 +180,11 @@ class KrlProgram:
         self._globals: list[dict[str, Any]] = []
         for number, source in enumerate(self._sources):
             self._globals.append({})
-            self._frames = [_Frame(number, {})]
+            self._frames[:] = [_Frame(number, {})]
             self._globals[-1].update(self._first_values(source.declarations))
             for element in source.elements:
                 self._write(element.target, self._value(element.value))
-        self._frames = [_Frame(0, {})]
+        self._frames[:] = [_Frame(0, {})]
         known = self._globals[0]
         for key, value in (settings or {}).items():
             if key.upper() not in known:
@@ -179,9 +206,10 @@ class KrlProgram:
     def run(self, session: KrcSession, now_ms: float) -> None:
         """Run all statements due at `now_ms` or before."""
         self._system.session = session
+        self._now_ms = now_ms
         if self._flow is None:
             self._flow = self._enter(self.source.main, [])
-        while not self.finished and self._due <= now_ms + 1e-6:
+        while not self.finished and self._due <= now_ms + _DUE_MS:
             self._clock = self._system.clock_ms = self._due
             try:
                 self._due = next(self._flow)
@@ -190,6 +218,16 @@ class KrlProgram:
             except (RobotError, ArithmeticError, TypeError, ValueError) as error:
                 self.finished = True
                 raise RobotError(f"{self.name}, line {self._line}: {error}") from error
+
+    @property
+    def due_ms(self) -> float:
+        """When the next statement is due; the first one at once."""
+        return self._due
+
+    @property
+    def moving(self) -> bool:
+        """Whether KRL's setpoint moves."""
+        return self._motion is not None
 
     def drive(self, session: KrcSession, now_ms: float) -> None:
         """Give the session KRL's setpoint at `now_ms`, the end of the next cycle, during a motion."""
@@ -211,13 +249,17 @@ class KrlProgram:
             return math.ceil(round((self._clock + after_ms) / TICK_MS, 9)) * TICK_MS
         return (math.floor(round(self._clock / TICK_MS, 9)) + 1) * TICK_MS
 
-    def _spend(self) -> Wait:
-        """The time of a statement, and of functions before it."""
+    def _spend(self) -> float | None:
+        """Take the time of a statement, and of functions before it; the time to wait for, None if it has come."""
         cost, self._owed = self._statement_ms + self._owed, 0.0
-        if cost > 0.0 and not self._nested:
-            yield self._clock + cost
-        elif self._nested:
+        if self._nested:
             self._owed += cost
+        elif cost > 0.0:
+            due = self._clock + cost
+            if due > self._now_ms + _DUE_MS:
+                return due
+            self._clock = self._system.clock_ms = due
+        return None
 
     def _pause(self, until_ms: float) -> Wait:
         if self._nested:
@@ -271,15 +313,66 @@ class KrlProgram:
 
     def _block(self, statements: tuple[tree.Statement, ...]) -> Flow:
         """Run statements; the result is EXIT or RETURN if one of them ended the block, else empty."""
-        for statement in statements:
-            self._line = statement.line
-            if self._is_plain(statement):
-                left = self._do(statement)
+        for step in self._steps(statements):
+            self._line = step.line
+            if not step.plain and (due := self._spend()) is not None:
+                yield due
+            if step.act is not None:
+                left = step.act()
+            elif step.choose is not None:
+                left = yield from self._block(step.choose())
             else:
-                left = yield from self._statement(statement)
+                left = yield from self._statement(step.statement)
             if left:
                 return left
         return ""
+
+    def _steps(self, statements: tuple[tree.Statement, ...]) -> list[_Step]:
+        """The statements of a block, prepared at its first run."""
+        steps = self._prepared.get(id(statements))
+        if steps is None:
+            self._prepared[id(statements)] = steps = [self._step_of(statement) for statement in statements]
+        return steps
+
+    def _step_of(self, statement: tree.Statement) -> _Step:
+        plain = self._is_plain(statement)
+        act: Callable[[], str] | None = None
+        choose: Callable[[], tuple[tree.Statement, ...]] | None = None
+        if plain or self._is_single(statement):
+            act = partial(self._do, statement)
+        if isinstance(statement, tree.Assign) and self._is_single(statement):
+            act = self._assignment(statement)
+        elif isinstance(statement, tree.Branch):
+            choose = partial(self._chosen, statement, self._evaluator(statement.condition))
+        elif isinstance(statement, tree.Switch):
+            choose = self._switch(statement)
+        return _Step(statement.line, plain, act, choose, statement)
+
+    def _assignment(self, statement: tree.Assign) -> Callable[[], str]:
+        value, write = self._evaluator(statement.value), self._writer(statement.target)
+
+        def act() -> str:
+            write(value())
+            return ""
+
+        return act
+
+    def _switch(self, statement: tree.Switch) -> Callable[[], tuple[tree.Statement, ...]]:
+        subject = self._evaluator(statement.subject)
+        cases = [([self._evaluator(value) for value in values], block) for values, block in statement.cases]
+
+        def choose() -> tuple[tree.Statement, ...]:
+            chosen = subject()
+            for values, block in cases:
+                if any(value() == chosen for value in values):
+                    return block
+            return statement.default
+
+        return choose
+
+    @staticmethod
+    def _chosen(statement: tree.Branch, condition: Callable[[], Any]) -> tuple[tree.Statement, ...]:
+        return statement.then if condition() else statement.otherwise
 
     def _is_plain(self, statement: tree.Statement) -> bool:
         """Whether the statement takes no time and never waits: it needs no `Flow` then."""
@@ -288,6 +381,20 @@ class KrlProgram:
             self._plain[id(statement)] = False  # for a subprogram that calls itself
             self._plain[id(statement)] = plain = self._statement_ms == 0.0 and self._cannot_wait(statement)
         return plain
+
+    def _is_single(self, statement: tree.Statement) -> bool:
+        """Whether the statement waits at most at its beginning, and runs no others."""
+        single = self._single.get(id(statement))
+        if single is None:
+            call = statement.value if isinstance(statement, (tree.Assign, tree.Leave)) else statement
+            own = (
+                isinstance(call, tree.Call)
+                and call.name in self._programs
+                and not isinstance(statement, tree.Leave)
+            )
+            single = isinstance(statement, (tree.Assign, tree.Leave, tree.Call)) and not own
+            self._single[id(statement)] = single
+        return single
 
     def _cannot_wait(self, statement: tree.Statement) -> bool:
         blocks: list[tuple[tree.Statement, ...]] = []
@@ -305,9 +412,9 @@ class KrlProgram:
 
     def _run_at_once(self, statements: tuple[tree.Statement, ...]) -> str:
         """As `_block`, for statements that never wait."""
-        for statement in statements:
-            self._line = statement.line
-            left = self._do(statement)
+        for step in self._steps(statements):
+            self._line = step.line
+            left = step.act() if step.act is not None else self._do(step.statement)
             if left:
                 return left
         return ""
@@ -325,7 +432,7 @@ class KrlProgram:
             chosen = statement.then if self._value(statement.condition) else statement.otherwise
             return self._run_at_once(chosen)
         elif isinstance(statement, tree.Switch):
-            return self._run_at_once(self._case(statement))
+            return self._run_at_once(self._switch(statement)())
         elif isinstance(statement, tree.Leave):
             if statement.value is not None:
                 self._frames[-1].result = copy.deepcopy(self._value(statement.value))
@@ -339,7 +446,6 @@ class KrlProgram:
 
     def _statement(self, statement: tree.Statement) -> Flow:
         left = ""
-        yield from self._spend()
         if isinstance(statement, tree.Assign):
             value = statement.value
             if isinstance(value, tree.Call) and value.name in self._programs:
@@ -356,11 +462,6 @@ class KrlProgram:
             left = statement.what
             if statement.value is not None:
                 self._frames[-1].result = copy.deepcopy(self._value(statement.value))
-        elif isinstance(statement, tree.Branch):
-            chosen = statement.then if self._value(statement.condition) else statement.otherwise
-            left = yield from self._block(chosen)
-        elif isinstance(statement, tree.Switch):
-            left = yield from self._block(self._case(statement))
         elif isinstance(statement, (tree.Loop, tree.Repeat)):
             left = yield from self._loop(statement)
         elif isinstance(statement, tree.For):
@@ -389,17 +490,11 @@ class KrlProgram:
             left = yield from self._block(statement.body)
             if left:
                 return "" if left == "EXIT" else left
-            yield from self._spend()
+            if (due := self._spend()) is not None:
+                yield due
             value += step
         self._write(statement.variable, value)
         return ""
-
-    def _case(self, statement: tree.Switch) -> tuple[tree.Statement, ...]:
-        subject = self._value(statement.subject)
-        for values, block in statement.cases:
-            if any(self._value(value) == subject for value in values):
-                return block
-        return statement.default
 
     def _loop(self, statement: tree.Loop | tree.Repeat) -> Flow:
         passes, until = 0, isinstance(statement, tree.Repeat)
@@ -412,7 +507,8 @@ class KrlProgram:
                 return "" if left == "EXIT" else left
             if until and statement.condition is not None and self._value(statement.condition):
                 return ""
-            yield from self._spend()
+            if (due := self._spend()) is not None:
+                yield due
             passes = passes + 1 if clock == self._clock else 0
             if passes > _LONGEST_RUN:
                 self._line = statement.line
@@ -467,33 +563,90 @@ class KrlProgram:
         }
 
     def _value(self, expression: tree.Expression) -> Any:
+        evaluate = self._evaluators.get(id(expression))
+        if evaluate is None:
+            self._evaluators[id(expression)] = evaluate = self._evaluator(expression)
+        return evaluate()
+
+    def _evaluator(self, expression: tree.Expression) -> Callable[[], Any]:
+        """The value of an expression as a function, prepared once."""
         if isinstance(expression, tree.Constant):
-            return expression.value
+            constant = expression.value
+            return lambda: constant
         if isinstance(expression, tree.Name):
-            return self._read(expression)
+            return self._reader(expression)
         if isinstance(expression, tree.Binary):
-            left, right = self._value(expression.left), self._value(expression.right)
-            if expression.operator == "/":
-                # KRL divides whole numbers without remainder.
-                whole = isinstance(left, int) and isinstance(right, int)
-                return int(left / right) if whole else left / right
-            return _OPERATORS[expression.operator](left, right)
+            left, right = self._evaluator(expression.left), self._evaluator(expression.right)
+            apply = _quotient if expression.operator == "/" else _OPERATORS[expression.operator]
+            return lambda: apply(left(), right())
         if isinstance(expression, tree.Unary):
-            value = self._value(expression.operand)
+            operand = self._evaluator(expression.operand)
             if expression.operator == "NOT":
-                return not value
-            return ~value if expression.operator == "B_NOT" else -value
+                return lambda: not operand()
+            return (lambda: ~operand()) if expression.operator == "B_NOT" else (lambda: -operand())
         if isinstance(expression, tree.Aggregate):
-            return {name: self._value(value) for name, value in expression.items}
+            items = [(name, self._evaluator(value)) for name, value in expression.items]
+            return lambda: {name: value() for name, value in items}
         if expression.name in self._programs:
-            self._nested += 1
-            try:
-                for _ in self._call(expression):
-                    pass
-            finally:
-                self._nested -= 1
-            return self._last.result
-        return self._system.call(expression.name, [self._value(one) for one in expression.arguments])
+            return partial(self._nested_call, expression)
+        arguments = [self._evaluator(one) for one in expression.arguments]
+        return lambda: self._system.call(expression.name, [one() for one in arguments])
+
+    def _nested_call(self, call: tree.Call) -> Any:
+        self._nested += 1
+        try:
+            for _ in self._call(call):
+                pass
+        finally:
+            self._nested -= 1
+        return self._last.result
+
+    def _reader(self, name: tree.Name) -> Callable[[], Any]:
+        """The value of a variable as a function; without indices to be worked out its place is found once."""
+        fixed = self._fixed_place(name)
+        if fixed is None:
+            return partial(self._read, name)
+        title, path = fixed
+        frames, modules, outside = self._frames, self._globals, self._system.reader(title, path)
+
+        def read() -> Any:
+            frame = frames[-1]
+            owner = frame.values
+            if title not in owner:
+                owner = modules[frame.module]
+                if title not in owner:
+                    return outside()
+            return get(owner[title], path, title) if path else owner[title]
+
+        return read
+
+    def _writer(self, name: tree.Name) -> Callable[[Any], None]:
+        """As `_reader`, to set a variable."""
+        fixed = self._fixed_place(name)
+        if fixed is None:
+            return partial(self._write, name)
+        title, path = fixed
+        frames, modules, outside = self._frames, self._globals, self._system.writer(title, path)
+
+        def write(value: Any) -> None:
+            frame = frames[-1]
+            owner = frame.values
+            if title not in owner:
+                owner = modules[frame.module]
+                if title not in owner:
+                    outside(value)
+                    return
+            owner[title] = put(owner[title], path, value, title)
+
+        return write
+
+    def _fixed_place(self, name: tree.Name) -> tuple[str, Path] | None:
+        """Name and path of a variable with constant indices only, else None."""
+        steps = ((name.index,) if name.index is not None else ()) + name.rest
+        if all(isinstance(step, (str, tree.Constant)) for step in steps):
+            title, path, _ = self._place(name)
+            return title, path
+        return None
 
     def _place(self, name: tree.Name) -> tuple[str, Path, dict[str, Any] | None]:
         """Name, path, and owner of a variable; None for the controller."""
@@ -543,6 +696,26 @@ class Interpreter:
         self.session = session
         self.program = program
         self._now_ms = 0
+
+    @property
+    def moving(self) -> bool:
+        """Whether the program moves KRL's setpoint."""
+        return self.program.moving
+
+    def idle_cycles(self, milliseconds: int) -> int:
+        """How often `advance` by `milliseconds` would do nothing before the next statement is due."""
+        if self.program.finished:
+            return _LONG
+        due_ms = self.program.due_ms
+        idle = max(math.ceil((due_ms - _DUE_MS - self._now_ms) / milliseconds), 0)
+        # Against rounding: the very comparison of `run`.
+        while idle and due_ms <= self._now_ms + (idle - 1) * milliseconds + _DUE_MS:
+            idle -= 1
+        return idle
+
+    def skip(self, milliseconds: int) -> None:
+        """Let `milliseconds` pass without a statement."""
+        self._now_ms += milliseconds
 
     def advance(self, milliseconds: int) -> None:
         """Let `milliseconds` pass, between two cycles; runs the statements due."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -316,6 +317,37 @@ class System:
             return kept if not path else 0
         return get(kept, path, title)
 
+    def reader(self, title: str, path: Path) -> Callable[[], Any]:
+        """``read`` of one place, as a function."""
+        if title not in _ARRAYS or not self._exists(title, path):
+            return partial(self.read, title, path)
+        number = self._place(title, path)
+        if title == "$FRI_FRM_INT":
+            return lambda: int(self._need().from_int[number - 1])
+        return partial(self._element, title, number)
+
+    def writer(self, title: str, path: Path) -> Callable[[Any], None]:
+        """``write`` of one place, as a function."""
+        if title not in _ARRAYS or not self._exists(title, path):
+            return partial(self.write, title, path)
+        number = self._place(title, path)
+        writers = {"$FRI_TO_INT": self._write_integer, "$FRI_TO_REA": self._write_real}
+        if title in writers:
+            return partial(writers[title], number - 1)
+        return partial(self._write_element, title, number)
+
+    def _write_integer(self, place: int, value: Any) -> None:
+        self._need().to_int[place] = min(max(int(value), -(2**31)), 2**31 - 1)
+
+    def _write_real(self, place: int, value: Any) -> None:
+        self._need().to_real[place] = float(value)
+
+    @staticmethod
+    def _exists(title: str, path: Path) -> bool:
+        """Whether the array has this element."""
+        number = path[0] if path else None
+        return isinstance(number, int) and 1 <= number <= _ARRAYS[title]
+
     def _keep(self, title: str, path: Path) -> Any:
         """Content of a kept variable; an unknown one is made as its first use has it."""
         if title not in self._kept:
@@ -400,9 +432,9 @@ class System:
             if bool(value) != stopped:
                 self._timers[number] = (self.clock_ms - value_now, bool(value))
         elif title == "$FRI_TO_INT":
-            session.to_int[place] = min(max(int(value), -(2**31)), 2**31 - 1)
+            self._write_integer(place, value)
         elif title == "$FRI_TO_REA":
-            session.to_real[place] = float(value)
+            self._write_real(place, value)
         else:
             bit = 1 << place
             session.to_bool = session.to_bool | bit if value else session.to_bool & ~bit

@@ -14,6 +14,7 @@ import math
 import struct
 from enum import Enum
 from math import hypot
+from typing import Any
 
 import numpy as np
 
@@ -257,6 +258,28 @@ class MsrBuffer:
         self.control = control
         self.error = error
         return None
+
+
+def leading(good: Any) -> int:
+    """Number of leading rows of `good`, (n,) or (n, ...), without a false value."""
+    return len(good) if good.all() else int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
+
+
+def plausible(packets: np.ndarray) -> int:
+    """How many leading `packets`, (n,) of `MSR`, have joint values that are sure to pass ``MsrBuffer.fault``.
+
+    Values at the very edge of what it passes are not sure.
+    """
+    # By the single values instead of the norm; false for NaN.
+    position, torque = _MAX_POSITION_NORM / math.sqrt(3 * JOINTS), _MAX_TORQUE_NORM / math.sqrt(JOINTS)
+    places = ("msr_jnt_pos", "cmd_jnt_pos", "cmd_jnt_pos_fri_offset")
+    limits = [*((name, position) for name in places), ("msr_jnt_trq", torque)]
+    return min(leading(np.abs(packets[name]) < limit) for name, limit in limits)
+
+
+def raw(records: np.ndarray) -> np.ndarray:
+    """The bytes (n, size) of `records` (n,), on the same memory; copies of them cost much less than field by field."""
+    return records.view(np.uint8).reshape(len(records), records.dtype.itemsize)
 
 
 class CmdBuffer:

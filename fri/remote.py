@@ -30,7 +30,17 @@ from numpy.typing import ArrayLike
 
 from fri.errors import ConfigurationError, NetworkError
 from fri.in_process import Network, Port
-from fri.packets import CMD_OFFSETS, JOINT_NAMES, JOINTS, Fault, MsrBuffer, new_cmd
+from fri.packets import (
+    CMD_OFFSETS,
+    JOINT_NAMES,
+    JOINTS,
+    MSR_SIZE,
+    Fault,
+    MsrBuffer,
+    leading,
+    new_cmd,
+    plausible,
+)
 from fri.sequence import Arrival, SequenceTracker
 from fri.states import FLAGS, Control, State
 
@@ -39,6 +49,11 @@ DEFAULT_PORT = 49938
 
 _CMD = int(State.CMD)
 _JNT_POS = slice(CMD_OFFSETS["jnt_pos"], CMD_OFFSETS["jnt_pos"] + 4 * JOINTS)
+# What does not change between plain successors.
+_STEADY = (
+    "packet_size", "datagram_id", "state", "quality", "msr_sample_time", "cmd_sample_time", "safety_limits",
+    "miss_counter", "power", "control", "error",
+)  # fmt: skip
 # Silence of the known port [s] before another port of the same host is taken for the restarted controller.
 _PORT_GRACE_S = 0.1
 # Number of foreign hosts named in events; further ones are counted only.
@@ -271,6 +286,70 @@ class RemoteEnd:
         out[_JNT_POS] = jnt_pos.data.cast("B")
         self._pack_sequence(out, 0, (self.send_seq + 1 + ahead) & 0xFFFF, (expected + ahead) & 0xFFFF)
 
+    def prepare(self, jnt_pos: np.ndarray) -> np.ndarray:
+        """The datagrams of ``answer`` to the next packets with the set points (n, 7), as (n,) of `CMD`.
+
+        RuntimeError if ``foreseen`` is None.
+        """
+        expected = self.foreseen
+        if expected is None:
+            raise RuntimeError("no answer can be prepared: the next packet is not known")
+        count = np.arange(len(jnt_pos))
+        commands = np.repeat(self.command[np.newaxis], len(count))
+        commands["send_seq"] = (self.send_seq + 1 + count) & 0xFFFF
+        commands["refl_seq"] = (expected + count) & 0xFFFF
+        commands["jnt_pos"] = jnt_pos
+        return commands
+
+    def recognise(self, packets: np.ndarray, commands: np.ndarray) -> int:
+        """How many leading `packets`, (n,) of `MSR`, are plain successors of the last packet.
+
+        Their counters follow, they reflect the last answer and then `commands` in turn, and state, control, drives and
+        times are those of the last packet. No other packet is judged here, ``receive`` does it.
+        """
+        msr, expected = self._msr, self.foreseen
+        if expected is None or not self._answered_last:
+            return 0
+        count = np.arange(len(packets))
+        good = packets["send_seq"] == (expected + count) & 0xFFFF
+        good &= packets["refl_seq"] == np.append(
+            np.uint16(self.send_seq), commands["send_seq"][: len(packets) - 1]
+        )
+        for name in _STEADY:
+            good &= packets[name] == msr.record[name]
+        return min(leading(good), plausible(packets))
+
+    def take(self, packets: np.ndarray, commands: np.ndarray) -> None:
+        """Take in recognised `packets`, (n,) of `MSR`, and their answers, (n,) of `CMD`, sent already."""
+        msr, count = self._msr, len(packets)
+        msr.buffer[:MSR_SIZE] = packets[-1].tobytes()
+        fault = msr.fault(MSR_SIZE)
+        assert fault is None
+        self._turn_torques(self.msr)
+        self.received_ns = monotonic_ns()
+        self._heard_s = self.received_ns * 1e-9
+        self._tracker.follow(count, msr.send_seq, msr.timestamp)
+        self.sequence = self._tracker.sequence
+        self.timestamp_s = msr.timestamp
+        self.received += count
+        self.answered += count
+        self._out[:] = commands[-1].tobytes()
+        self.send_seq = int(commands[-1]["send_seq"])
+        self._answered_seq = msr.send_seq
+
+    def turned(self, packets: np.ndarray) -> np.ndarray:
+        """The `packets`, (n,) of `MSR`, with their torques in the sign of ``set_torque_sign``."""
+        if self._torque_sign is None:
+            return packets
+        packets = packets.copy()
+        self._turn_torques(packets)
+        return packets
+
+    def _turn_torques(self, msr: np.ndarray) -> None:
+        if self._torque_sign is not None:
+            msr["msr_jnt_trq"] *= self._torque_sign
+            msr["est_ext_jnt_trq"] *= self._torque_sign
+
     def receive(
         self, timeout_s: float, arrived: tuple[int, tuple[str, int], int] | None = None
     ) -> np.ndarray | None:
@@ -475,9 +554,7 @@ class RemoteEnd:
         if self._answered_last and tracker.lost == losses and msr.refl_seq != self.send_seq:
             self.unreflected += 1
         self._answered_last = False
-        if self._torque_sign is not None:
-            self.msr["msr_jnt_trq"] *= self._torque_sign
-            self.msr["est_ext_jnt_trq"] *= self._torque_sign
+        self._turn_torques(self.msr)
         self.received += 1
         self.received_ns = now_ns
         self.sequence = tracker.sequence

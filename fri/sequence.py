@@ -92,6 +92,11 @@ class SequenceTracker:
             return self._advance(1, send_seq, timestamp)
         return self._jump(delta, send_seq, timestamp, sample_time, new_source)
 
+    def follow(self, count: int, send_seq: int, timestamp: float) -> None:
+        """Take in `count` packets, each the successor of the one before; the last has this counter and timestamp."""
+        self._advance(1, send_seq, timestamp)
+        self.sequence += count - 1
+
     def _advance(self, step: int, send_seq: int, timestamp: float) -> Arrival:
         self.sequence += step
         self.lost += step - 1

@@ -79,6 +79,19 @@ class AnswerStatistics:
             self._remember(slot, latency_ns)
             self._rate_latency()
 
+    def steady(self, latency_ns: int) -> bool:
+        """Whether the window holds nothing but answers in time of this latency: one more changes no figure."""
+        window = self._window
+        return (
+            self.packets == self._answered == self._timed == window
+            and self._sum == window * latency_ns
+            and self._squares == window * latency_ns * latency_ns
+        )
+
+    def repeat(self, count: int) -> None:
+        """Close `count` packets more in a `steady` window, each with the answer that the window is full of."""
+        self._slot = (self._slot + count) % self._window
+
     def _remember(self, slot: int, latency_ns: int) -> None:
         self._latencies[slot] = latency_ns
         self._timed += 1

@@ -113,11 +113,34 @@ class SetpointTrack:
 
     def command(self, q: np.ndarray) -> np.ndarray:
         """Go on to the command `q`; the setpoints of the period, (n, 7)."""
+        self._accept(q)
+        return self._go(q)
+
+    def _accept(self, q: np.ndarray) -> None:
         self._span = self.missed + 1
         self._step = (q - self._accepted) / self._span
         self._accepted = q
         self.missed = 0
-        return self._go(q)
+
+    def lines(self, commands: np.ndarray) -> np.ndarray:
+        """The setpoints of the periods of the commands (m, 7), one after the other, (m n, 7)."""
+        if self._period_ms == 1:
+            return commands
+        starts = np.concatenate([self.target[np.newaxis], commands[:-1]])[:, np.newaxis]
+        ends = commands[:, np.newaxis]
+        positions = starts + self._fractions * (ends - starts)
+        positions[:, -1:] = ends
+        return positions.reshape(-1, JOINTS)
+
+    def follow(self, before: np.ndarray, q: np.ndarray) -> None:
+        """Be where ``command`` leads with q after `before`, (7,) each; `accept` completes it."""
+        self._previous, self.target, self._goal = before, q, q
+
+    def accept(self, commands: np.ndarray) -> None:
+        """The commands (m, 7) that were followed, all after the last one of ``command`` or ``accept``."""
+        # Nothing of a command is left after the next two.
+        for q in commands[-2:]:
+            self._accept(q)
 
     def extrapolated(self) -> np.ndarray:
         """The setpoint one step further on, (7,)."""

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fri.packets import leading
 from lwr_driver.arm import JOINTS, ArmLimits
 from lwr_driver.control import Control, Mode, Result, Text, Word
 from lwr_driver.guard import Guard, Retreat, Stop, Violation
@@ -249,6 +250,46 @@ class Commander:
             return None
         self._commit(target)
         return target
+
+    def rows_ahead(self, sequence: int, most: int) -> NDArray[np.float32]:
+        """Values of `command` for the packets from number `sequence` on, (n, 7), while the motion just goes on.
+
+        Each has passed the guard after those before it. n is `most` or less, and 0 where the next value is none of
+        these: outside a motion, after a gap, at the beginning of a phase, at its last row, or where the guard objects.
+        """
+        first, last = sequence - self._base, self._rows - 1
+        if self.mode is not Mode.MOTION or self._since_sent or first != self.index + 1 or self.index < 0:
+            return np.zeros((0, JOINTS), dtype=np.float32)
+        if self._next_phase < int(self._control.words[Word.PHASES]):
+            last = min(last, int(self._control.phase_rows[self._next_phase]))
+        rows = self._plan[first : max(min(first + most, last), first)].astype(np.float32)
+        return rows[: self._guard.check_rows(rows)] if len(rows) else rows
+
+    def watch_rows(
+        self, values: NDArray[np.float32], setpoints: NDArray[np.float32], q: NDArray[np.float32]
+    ) -> int:
+        """In how many leading packets arm and set point are as near to the value sent before as in `watch`.
+
+        values : of `rows_ahead`; setpoints, q : of the packets that they answer; (n, 7) each
+        """
+        error, away = self._distances(values, q), self._distances(values, setpoints)
+        limit = self._tracking_limit
+        return leading(~((error > limit) | (away > limit)))
+
+    def take_rows(self, values: NDArray[np.float32], q: NDArray[np.float32]) -> None:
+        """The `values` of `rows_ahead`, (n, 7), have been sent; q : of the packets that they answer."""
+        tracking = self._control.tracking
+        np.maximum(tracking, self._distances(values, q).max(axis=0), out=tracking)
+        self._guard.remember_rows(values)
+        self.index += len(values)
+        for back in range(3):
+            self._past[back] = self._plan[max(self.index - back, 0)]
+        self.target = values[-1].copy()
+        self._sent += len(values)
+
+    def _distances(self, values: NDArray[np.float32], rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        before = np.concatenate([self.target[np.newaxis], values[:-1]])
+        return np.abs(rows - before)
 
     def stop(self, result: Result, reason: str) -> None:
         """Begin a stop within the limits; `ended` is (`result`, `reason`) once the arm holds."""

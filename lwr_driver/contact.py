@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
+from fri.packets import leading
 from fri.quantities import within
 from lwr_driver.arm import JOINTS, Arm
 
@@ -382,27 +383,153 @@ class ContactWatch:
         if self._settling or not self._alive:
             self.external[:] = 0.0
             return
-        pin, model, data = self._pin, self._model, self._data
         q, tau = self._filter[0, :JOINTS], self._filter[0, JOINTS:]
         qd = self._filter[1, :JOINTS]
-        qdd = self._square * (self._now[:JOINTS] - q) - self._double * qd
-        expected = pin.rnea(model, data, q, qd, qdd)
-        if not self._carried and gravity.any():
-            expected = expected + gravity - pin.computeGeneralizedGravity(model, data, q)
+        qdd = self._acceleration(q, qd, self._now[:JOINTS])
+        expected = self._pin.rnea(self._model, self._data, q, qd, qdd)
+        if self._listens and gravity.any():
+            expected = expected + gravity - self._weight(q)
         if self._friction:
-            sign = np.minimum(np.maximum(qd / _SIGN_SPEED, -1.0), 1.0)
-            expected = expected + self._viscous * qd + self._coulomb * sign + self._offset
-            # A change of sign passes the low-pass gradually.
-            turns = qd * (qd + self._lag * qdd) <= 0.0
-            self._open = np.maximum(np.where(turns, 1.0, 1.0 - np.abs(sign)), self._closing * self._open)
+            friction, unsure = self._frictions(qd, qdd)
+            expected = expected + friction
+            self._open = np.maximum(unsure, self._closing * self._open)
             np.add(self._threshold, self._coulomb * self._open, out=self.allowed)
         np.subtract(expected, tau, out=self.external)
+
+    def _acceleration(self, q: Floats, qd: Floats, measured: Floats) -> Floats:
+        """Acceleration by the low-pass at q, qd for the position `measured`; (..., 7) each."""
+        acceleration: Floats = self._square * (measured - q) - self._double * qd
+        return acceleration
+
+    @property
+    def _listens(self) -> bool:
+        """Whether the packet's gravity torque tells the weight of the payload."""
+        return not self._carried
+
+    def _weight(self, q: Floats) -> Floats:
+        """Gravity torque of the expected bodies (7,)."""
+        weight: Floats = self._pin.computeGeneralizedGravity(self._model, self._data, q)
+        return weight
+
+    def _frictions(self, qd: Floats, qdd: Floats) -> tuple[Floats, Floats]:
+        """Friction with offset, and the share of it with an uncertain sign; (..., 7) each."""
+        sign = np.minimum(np.maximum(qd / _SIGN_SPEED, -1.0), 1.0)
+        friction = self._viscous * qd + self._coulomb * sign + self._offset
+        # A change of sign passes the low-pass gradually.
+        turns = qd * (qd + self._lag * qdd) <= 0.0
+        return friction, np.where(turns, 1.0, 1.0 - np.abs(sign))
+
+    def ahead(
+        self,
+        q: NDArray[np.float32],
+        tau: NDArray[np.float32],
+        estimate: NDArray[np.float32],
+        gravity: NDArray[np.float32],
+    ) -> WatchAhead:
+        """The next packets, each a cycle after the one before it, as `update` would take them; (n, 7) each.
+
+        The result ends before the first packet with a limit exceeded, a jump or a repeated position.
+        """
+        packets = np.concatenate([q, tau, estimate, gravity], axis=1).astype(np.float64)
+        doubtful = self._doubted or self._unmeasured or self._settling or self.stale is not None
+        if not self._known or not self._alive or doubtful:
+            return WatchAhead(self, packets[:0])
+        return WatchAhead(self, packets)
 
     def _contact(self) -> Contact:
         excess = np.where(np.isnan(self._excess), np.inf, self._excess)
         kind, joint = divmod(int(np.argmax(excess)), JOINTS)
         limit = float((self._most if kind == 0 else self.allowed)[joint])
         return Contact(_QUANTITIES[kind], joint, float(self._excess[kind, joint]) + limit, limit)
+
+
+class WatchAhead:
+    """Packets looked at beforehand, see `ContactWatch.ahead`; `place` takes them.
+
+    count : of leading packets that need nothing else
+    """
+
+    def __init__(self, watch: ContactWatch, packets: Floats) -> None:
+        self._watch = watch
+        before = np.concatenate([watch._last[np.newaxis], packets[:-1]]) if len(packets) else packets
+        change = packets - before
+        self._packets, self._steps = packets, change[:, :JOINTS] + 0.0
+        self.count = self._calm(before, change)
+        if self.count:
+            self._filter(before, change)
+            self._estimate()
+            self.count = self._within()
+
+    def _calm(self, before: Floats, change: Floats) -> int:
+        """Packets up to the first with a jump or a repeated position."""
+        if not len(change):
+            return 0
+        watch = self._watch
+        step = np.tile(watch._step, (len(change), 1))
+        step[1:, :JOINTS] = self._steps[:-1]
+        same = self._packets[:, :JOINTS] == before[:, :JOINTS]
+        repeated = same & (np.abs(step[:, :JOINTS]) > watch._slowest)
+        odd = np.abs(change - step)
+        return min(leading(odd <= watch._jump), leading(~repeated))
+
+    def _filter(self, before: Floats, change: Floats) -> None:
+        """States of the low-pass after each packet, and its input: `ContactWatch._low_pass` for single cycles."""
+        watch, ends = self._watch, 2 * JOINTS
+        self._sources = change[: self.count, :ends] * 1.0
+        self._sources += before[: self.count, :ends]
+        self._sources += before[: self.count, :ends]
+        self._states = np.empty((self.count, 2, ends))
+        state, matrix = np.empty((3, ends)), watch._advance
+        state[:2] = watch._state
+        for source, result in zip(self._sources, self._states, strict=True):
+            state[2] = source
+            matrix.dot(state, result)
+            state[:2] = result
+
+    def _estimate(self) -> None:
+        """The own estimate and its limit after each packet."""
+        watch, states, packets = self._watch, self._states, self._packets[: self.count]
+        q, qd, tau = states[:, 0, :JOINTS], states[:, 1, :JOINTS], states[:, 0, JOINTS:]
+        qdd = watch._acceleration(q, qd, packets[:, :JOINTS])
+        gravity = packets[:, 3 * JOINTS :]
+        expected = np.empty_like(q)
+        rnea, model, data = watch._pin.rnea, watch._model, watch._data
+        for result, *rows in zip(expected, q, qd, qdd, strict=True):
+            result[:] = rnea(model, data, *rows)
+        if watch._listens and gravity.any():
+            weight = np.array([watch._weight(row).copy() for row in q])
+            given = np.any(gravity, axis=1, keepdims=True)
+            expected = np.where(given, expected + gravity - weight, expected)
+        self._open, self._allowed = (
+            np.tile(watch._open, (self.count, 1)),
+            np.tile(watch.allowed, (self.count, 1)),
+        )
+        if watch._friction:
+            friction, unsure = watch._frictions(qd, qdd)
+            expected = expected + friction
+            open_now = watch._open
+            for row, floor in enumerate(unsure):
+                self._open[row] = open_now = np.maximum(floor, watch._closing * open_now)
+            self._allowed = watch._threshold + watch._coulomb * self._open
+        self._external = expected - tau
+
+    def _within(self) -> int:
+        """Packets up to the first with a limit exceeded."""
+        torques = np.abs(self._packets[: self.count, JOINTS : 3 * JOINTS])
+        good = (torques[:, :JOINTS] - self._watch._most <= 0.0) & (torques[:, JOINTS:] - self._allowed <= 0.0)
+        good &= np.abs(self._external) - self._allowed <= 0.0
+        return leading(good)
+
+    def place(self, done: int) -> None:
+        """Take the first `done` packets."""
+        watch, last = self._watch, done - 1
+        watch._last[:] = self._packets[last]
+        watch._step[:JOINTS] = self._steps[last]
+        watch._state[:], watch._input[:] = self._states[last], self._sources[last]
+        watch._open = self._open[last].copy()
+        watch.allowed[:], watch.external[:] = self._allowed[last], self._external[last]
+        watch._bend[:] = 0.0
+        watch._repeats = 0
 
 
 def _parts(packet: Floats) -> tuple[Floats, ...]:

@@ -23,6 +23,9 @@ from lwr_driver.ring import ROW
 HISTORY = 128
 """Rows kept for an exception or a snapshot, newest last."""
 
+HISTORY_STEP = HISTORY // 4
+"""Most rows written there before they are counted: readers take up to half of the history."""
+
 BIN_NS = 2_000
 """Width of a bin of the reply latency histogram; the last bin holds all longer latencies."""
 

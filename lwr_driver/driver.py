@@ -72,7 +72,7 @@ LOCK_STEP_EPOCH_NS = 1_577_836_800 * 10**9
 ROWS_KEPT = 50
 """Cycles attached to an error or an outcome."""
 
-_POLL_S = 0.002
+_POLL_S, _MOTION_POLL_S = 0.002, 0.005
 _NOTIFY_S = 0.5
 _PROGRESS_S = 0.1
 _SHORTEST_CYCLE_S = 1e-3
@@ -336,7 +336,7 @@ class Driver:
         watch, poor = _Watch(self), False
         try:
             while not self._need(self._control).done:
-                time.sleep(_POLL_S)
+                time.sleep(_MOTION_POLL_S)
                 watch.check(self.link.lock_step_patience_s)
                 if time.monotonic() < following:
                     continue

@@ -30,6 +30,7 @@ limits.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 
@@ -37,6 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
 
+from fri.packets import leading
 from lwr_driver.arm import JOINTS, ArmLimits
 
 # Half the spacing of float32 numbers between 2 and 4 rad; joint positions of the arm are below 3 rad.
@@ -47,6 +49,8 @@ RETREAT_SPEED = 0.25
 
 _UNITS = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "jerk": "rad/s³"}
 _SLACK = 1e-9
+
+Rows = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -110,15 +114,12 @@ class Guard:
         h3 = cycles * self._period
         two, three = h3 + self._h2, h3 + self._h2 + self._h1
         x = q.astype(np.float64)
-        v = (x - self._q) / h3
-        a = (v - self._v) * (2.0 / two)
         values, errors = self._values, self._errors
         np.subtract(x, self._middle, out=values[0])
-        values[1], values[2] = v, a
-        np.multiply(a - self._a, 3.0 / three, out=values[3])
-        v_error = 2.0 * ROUNDING / h3
-        a_error = 2.0 * (v_error + self._v_error) / two
-        errors[1], errors[2], errors[3] = v_error, a_error, 3.0 * (a_error + self._a_error) / three
+        v, a, j = self._derivatives(x, h3, two, three, _last)
+        values[1], values[2], values[3] = v, a, j
+        v_error, a_error, j_error = self._roundings(h3, two, three)
+        errors[1], errors[2], errors[3] = v_error, a_error, j_error
         excess = np.abs(values, out=self._excess)
         excess -= self._bounds
         excess -= errors
@@ -136,6 +137,46 @@ class Guard:
         self._h1, self._h2 = self._h2, h3
         return None
 
+    def check_rows(self, q: NDArray[np.float32]) -> int:
+        """How many leading rows of q (n, 7), each sent one cycle after the row before it, pass `check`.
+
+        Nothing is remembered, see `remember_rows`. 0 as well while something of the values before is still special:
+        a gap between them, a beginning, or an arm outside the position limits.
+        """
+        spans = self._period, self._period + self._h2, self._period + self._h2 + self._h1
+        v_error, a_error, j_error = self._roundings(*spans)
+        regular = self._h1 == self._h2 == self._period
+        if not regular or self._outside or (v_error, a_error) != (self._v_error, self._a_error):
+            return 0
+        x = q.astype(np.float64)
+        v, a, j = self._derivatives(x, *spans, _before)
+        excess = np.abs(np.stack([x - self._middle, v, a, j], axis=1))
+        excess -= self._bounds
+        excess -= np.array([[ROUNDING], [v_error], [a_error], [j_error]])
+        # Also false for NaN.
+        return leading(excess <= _SLACK)
+
+    def remember_rows(self, q: NDArray[np.float32]) -> None:
+        """Rows of q (n, 7) that have passed `check_rows` are sent."""
+        x = q.astype(np.float64)
+        spans = self._period, self._period + self._h2, self._period + self._h2 + self._h1
+        v, a, _ = self._derivatives(x, *spans, _before)
+        self._q, self._v, self._a = x[-1], v[-1], a[-1]
+
+    def _derivatives(
+        self, x: Rows, h3: float, two: float, three: float, before: Callable[[Rows, Rows], Rows]
+    ) -> tuple[Rows, Rows, Rows]:
+        """Velocity, acceleration and jerk at x. before : the value before each of the values, given the last one"""
+        v = (x - before(self._q, x)) / h3
+        a = (v - before(self._v, v)) * (2.0 / two)
+        return v, a, (a - before(self._a, a)) * (3.0 / three)
+
+    def _roundings(self, h3: float, two: float, three: float) -> tuple[float, float, float]:
+        """Largest effects of rounding on velocity, acceleration and jerk."""
+        v_error = 2.0 * ROUNDING / h3
+        a_error = 2.0 * (v_error + self._v_error) / two
+        return v_error, a_error, 3.0 * (a_error + self._a_error) / three
+
     def _violation(self, x: NDArray[np.float64]) -> Violation:
         limits = self._limits
         broken = ~(self._excess <= _SLACK)
@@ -148,7 +189,14 @@ class Guard:
         return Violation(tuple(_UNITS)[kind], joint, float(value), float(bound))
 
 
-Rows = NDArray[np.float64]
+def _last(last: Rows, rows: Rows) -> Rows:
+    """For a single value: the last one."""
+    return last
+
+
+def _before(last: Rows, rows: Rows) -> Rows:
+    """For rows (n, 7): the row before each."""
+    return np.concatenate([last[np.newaxis], rows[:-1]])
 
 
 class Stop:

@@ -14,10 +14,16 @@ import select
 import socket
 import time
 import traceback
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, LwrError, NetworkError
 from fri.in_process import Network
+from fri.packets import CMD
 from lwr_driver.arm import ArmLimits
 from lwr_driver.control import Control, Word
 from lwr_driver.loop import Loop, LoopSettings
@@ -25,6 +31,9 @@ from lwr_driver.loop_process import Watch, loop_of, order_of
 from lwr_driver.realtime import Rights
 from lwr_driver.ring import Ring
 
+T = TypeVar("T")
+
+_NONE = np.zeros(0, CMD)
 _MESSAGE_BYTES = 1 << 17
 _START_TIMEOUT_S = 60.0
 _END_TIMEOUT_S = 3.0
@@ -152,12 +161,31 @@ class Seat:
         if control.words[Word.QUIT]:
             self._leave("")
             return False
+        return self._ask(loop.turn, False)
+
+    def offer(self, most: int) -> NDArray[Any]:
+        """Answers to the coming packets beforehand, see `Loop.offer`; none without a loop."""
+        loop, control = self._loop, self._control
+        if loop is None or control is None or control.words[Word.QUIT]:
+            return _NONE
+        return self._ask(partial(loop.offer, most), _NONE)
+
+    def accept(self, packets: NDArray[Any], commands: NDArray[Any]) -> int:
+        """For how many of the `packets` the answers hold, see `Loop.accept`."""
+        return 0 if self._loop is None else self._ask(partial(self._loop.accept, packets, commands), 0)
+
+    def take(self, packets: NDArray[Any], commands: NDArray[Any]) -> None:
+        """Hand accepted `packets` over, see `Loop.take`."""
+        if self._loop is not None:
+            self._ask(partial(self._loop.take, packets, commands), None)
+
+    def _ask(self, question: Callable[[], T], otherwise: T) -> T:
         try:
-            return loop.turn()
+            return question()
         except Exception as error:  # a process of its own would have ended
             traceback.print_exc()
             self._leave(f"{type(error).__name__}: {error}")
-            return False
+            return otherwise
 
     def serve(self) -> bool:
         """Take an order; False if the driver's process is gone."""

@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 
 from fri.handshake import IdentificationHandshake, find_handshake
 from fri.in_process import Network
+from fri.packets import CMD, raw
 from fri.remote import LinkEvent, RemoteEnd
 from fri.states import ALL_DRIVES, Quality, State
 from fri.states import Control as ControlMode
 from lwr_driver.arm import JOINTS, ArmLimits
 from lwr_driver.commander import Commander
-from lwr_driver.contact import Contact, ContactWatch, Stale
-from lwr_driver.control import BIN_NS, HISTORY, Control, Job, Mode, Result, Text, Word
+from lwr_driver.contact import Contact, ContactWatch, Stale, WatchAhead
+from lwr_driver.control import BIN_NS, HISTORY, HISTORY_STEP, Control, Job, Mode, Result, Text, Word
 from lwr_driver.pace import Pace, Stamps
 from lwr_driver.ring import ROW, Ring
 
@@ -44,6 +45,10 @@ _LOOKOUT_S, _LOOKOUT_SHARE = 1.2e-3, 0.4
 _OVERDUE_S = 0.15e-3
 # Jobs without a message to the KRL program.
 _LEAVE_ALONE = (Job.NONE, Job.MOTION, Job.CYCLES)
+# Rows written at once fill at most this share of the ring, so that its onlookers are not overtaken.
+_RING_SHARE = 4
+# What the watch sees of a packet.
+_WATCHED = ("msr_jnt_pos", "msr_jnt_trq", "est_ext_jnt_trq", "gravity")
 _REMIND_S = 1.0  # silence in lock step before a reminder to the other side
 _STILL_RAD = 1e-5  # largest step per cycle of a set point at rest
 # A motion ends after so many packets of quality UNACCEPTABLE in command mode, or so long below OK.
@@ -170,6 +175,8 @@ class Loop:
         self._answered = False
         self._restarts = 0
         self._last_event: LinkEvent | None = None
+        self._offered_ns = 0
+        self._looked: WatchAhead | None = None  # at accepted packets not taken yet
 
         self._request = int(self._words[Word.REQUEST])
         self._job = Job.NONE
@@ -255,6 +262,87 @@ class Loop:
         self._write_row(self._answered, turnaround.sent_ns if turnaround is not None and sent else None)
         self._advance_job(max(elapsed, 1))
         return True
+
+    def offer(self, most: int) -> NDArray[Any]:
+        """In lock step, the answers to the coming packets, at most `most`, as (n,) of `CMD`; nothing is sent.
+
+        They are given while a motion just goes on and hold for packets that `accept` finds in order: then each is the
+        very answer of `cycle`. None otherwise, n = 0: the next packet goes through `cycle`.
+        """
+        self._take_request()
+        self._offered_ns = time.monotonic_ns()
+        remote, words, ring = self.remote, self._words, self._ring
+        ordinary = (
+            self._job is Job.MOTION
+            and self._begun
+            and int(words[Word.STOP]) == self._b
+            and self._limit == 0
+            and self._alarm is None
+            and self._answered
+            and not (self._doubted or self._held_back)
+            and self.pace is None
+            and remote.sequence == self._sequence
+            and remote.sample_time_s == self._sample_time
+            and remote.state == State.CMD
+            and remote.power == ALL_DRIVES
+            and remote.error == 0
+            and remote.quality >= Quality.OK
+            and remote.restarts == self._restarts
+            and remote.foreseen is not None
+        )
+        if ring is not None:
+            most = min(most, ring.free, ring.capacity // _RING_SHARE)
+        values = self._commander.rows_ahead(self._count + 1, most if ordinary else 0)
+        return remote.prepare(values) if len(values) else np.zeros(0, CMD)
+
+    def accept(self, packets: NDArray[Any], commands: NDArray[Any]) -> int:
+        """For how many leading `packets`, (n,) of `MSR`, the answers `commands` of `offer` hold.
+
+        These are packets in which nothing has happened: the same tests as for each packet of `cycle`.
+        """
+        remote, watch = self.remote, self._watch
+        count = remote.recognise(packets, commands)
+        packets = packets[:count]
+        setpoints = packets["cmd_jnt_pos"] + packets["cmd_jnt_pos_fri_offset"]
+        count = self._commander.watch_rows(commands["jnt_pos"][:count], setpoints, packets["msr_jnt_pos"])
+        if watch is None or not count:
+            return count
+        packets = remote.turned(packets[:count])
+        self._looked = watch.ahead(*(packets[name] for name in _WATCHED))
+        return self._looked.count
+
+    def take(self, packets: NDArray[Any], commands: NDArray[Any]) -> None:
+        """Take in accepted `packets` and their answers, (n,) each, as `cycle` does one by one."""
+        count, words = len(packets), self._words
+        values = commands["jnt_pos"].astype(np.float32)
+        before = self._sequence
+        self.remote.take(packets, commands)
+        packets = self.remote.turned(packets)
+        if self._looked is not None:
+            self._looked.place(count)
+            self._looked = None
+        first_index = self._commander.index + 1
+        self._commander.take_rows(values, packets["msr_jnt_pos"])
+        self._note_packets(packets)
+        self._sequence += count
+        self._count += count
+        self._job_cycles += count
+        self._unacceptable = self._bad = 0
+        self._heard_s = self.remote.received_ns * 1e-9
+        words[Word.HEARD_NS] = self.remote.received_ns
+        sent_ns = time.monotonic_ns()
+        # Together they took this time, each a share of it.
+        share_ns = (sent_ns - self._offered_ns) // count
+        self._control.latency[min(share_ns // BIN_NS, len(self._control.latency) - 1)] += count
+        self._write_rows(before + 1, first_index, packets, commands)
+
+    def _note_packets(self, packets: NDArray[Any]) -> None:
+        """Set points and time stamps of plain successors, as far as later packets are compared with them."""
+        setpoints = (packets["cmd_jnt_pos"] + packets["cmd_jnt_pos_fri_offset"])[-3:]
+        past = [(setpoint.copy(), 1) for setpoint in setpoints[::-1]]
+        self._past_setpoints = [*past, *self._past_setpoints][:3]
+        for stamp in packets["timestamp"][-2:].tolist():
+            self._stamps.feed(1, stamp, self._sample_time)
 
     def _passed(self, counted: int, sent: bool) -> int:
         """How many of the `counted` cycles have passed by the clocks; 0 for a packet ahead of its time."""
@@ -723,6 +811,29 @@ class Loop:
         words[Word.MODE], words[Word.INDEX] = int(self._commander.mode), index
         if index >= 0:
             words[Word.ROW] = index
+        self._publish_counters()
+
+    def _write_rows(self, sequence: int, index: int, packets: NDArray[Any], commands: NDArray[Any]) -> None:
+        """The rows of plain packets from number `sequence` on, answered with the rows of the motion from `index` on."""
+        control, words, count = self._control, self._words, np.arange(len(packets))
+        rows = np.zeros(len(packets), dtype=ROW)
+        rows["sequence"] = sequence + count
+        rows["t_recv"] = rows["t_send"] = rows["sequence"] * round(self._period * 1e9)
+        rows["plan_index"], rows["phase"] = index + count, self._commander.phase
+        rows["answered"] = 1
+        content = raw(rows)
+        content[:, self._msr_place], content[:, self._cmd_place] = raw(packets), raw(commands)
+        if self._ring is not None:
+            self._ring.publish_rows(rows)
+            self._ring.beat(time.monotonic_ns())
+        history = raw(control.history)
+        for start in range(0, len(rows), HISTORY_STEP):
+            some = content[start : start + HISTORY_STEP]
+            cycles = int(words[Word.CYCLES])
+            history[(cycles + np.arange(len(some))) % HISTORY] = some
+            words[Word.CYCLES] = cycles + len(some)
+        words[Word.MODE] = int(self._commander.mode)
+        words[Word.INDEX] = words[Word.ROW] = self._commander.index
         self._publish_counters()
 
     def _publish_counters(self) -> None:

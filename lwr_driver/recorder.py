@@ -28,6 +28,8 @@ from lwr_driver.session.writer import ExitStatus
 
 _PAUSE_S = 0.02
 _BUSY_ROWS = 1000
+# Rows are encoded in batches: so many at least, or this share of the ring, or those of this time.
+_BATCH_ROWS, _BATCH_SHARE, _BATCH_S = 1000, 8, 0.1
 _START_TIMEOUT_S = 60.0
 _REPLY_TIMEOUT_S = 60.0
 _NICE = 5
@@ -220,6 +222,7 @@ class _Server:
         self._recording: Recording | None = None
         self._ended: Recorded | None = None
         self._overruns = 0
+        self._due_s = 0.0
         self.end_reason = ""
 
     def run(self) -> None:
@@ -239,8 +242,16 @@ class _Server:
                 self._drain(None)
                 self._end_by_failure("the process that drove the experiment died")
                 return
-            busy = self._drain(None) >= _BUSY_ROWS
+            busy = self._due() and self._drain(None) >= _BUSY_ROWS
             self._watch_writer()
+
+    def _due(self) -> bool:
+        """Whether there are rows enough for a batch, or the last one was long ago."""
+        waiting, now = self._ring.head - self._ring.tail, time.monotonic()
+        if waiting < min(_BATCH_ROWS, self._ring.capacity // _BATCH_SHARE) and now < self._due_s:
+            return False
+        self._due_s = now + _BATCH_S
+        return True
 
     def _answer(self, name: str, *arguments: Any) -> bool:
         try:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, FileError
-from fri.packets import CMD, MSR
+from fri.packets import CMD, MSR, raw
 
 CAPACITY = 8192
 """Default number of rows: 8 s at 1 kHz, 11 MB."""
@@ -152,6 +152,16 @@ class Ring:
         self._head[0] = published + 1
         return True
 
+    def publish_rows(self, rows: NDArray[Any]) -> None:
+        """As `publish` for each of the `rows`, (n,) of `ROW`, at most `free`."""
+        published, content = self._published, rows.view(np.uint8).data
+        first = min(len(rows), self.capacity - published % self.capacity)
+        at, size = published % self.capacity * ROW.itemsize, ROW.itemsize
+        self._bytes[at : at + first * size] = content[: first * size]
+        self._bytes[: (len(rows) - first) * size] = content[first * size :]
+        self._published = published + len(rows)
+        self._head[0] = self._published
+
     def beat(self, now_ns: int) -> None:
         """Sign of life of the writer, for each pass of the loop, also while no packet comes."""
         self._beat[0] = now_ns
@@ -167,9 +177,9 @@ class Ring:
         if head <= tail:
             return np.zeros(0, dtype=ROW)
         first, last = tail % self.capacity, (head - 1) % self.capacity
-        if first <= last:
-            return self._rows[first : last + 1].copy()
-        return np.concatenate([self._rows[first:], self._rows[: last + 1]])
+        rows = raw(self._rows)
+        parts = [rows[first : last + 1]] if first <= last else [rows[first:], rows[: last + 1]]
+        return np.concatenate(parts).view(ROW).reshape(-1)
 
     def release(self, count: int) -> None:
         """Free the `count` oldest rows for the writer."""

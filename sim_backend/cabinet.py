@@ -92,8 +92,8 @@ class Cabinet:
         self.moving = False
         self.under_way = False
         self._idle_cycles = 0
-        self._last_setpoint = np.zeros(self.joints)
-        self._model_age = 0
+        self.last_setpoint = np.zeros(self.joints)
+        self.model_age = 0
         self._commanding = False
         self._load_turn = (0.0, 0.0, 0.0)
         self._load_told: tuple[LoadData | None, tuple[float, ...], tuple[float, ...]] = None, (), ()
@@ -133,7 +133,7 @@ class Cabinet:
     def _begin(self, position: np.ndarray) -> None:
         """At rest at `position`, under control, with a cold session."""
         self.plant.reset(position)
-        self._last_setpoint[:] = position
+        self.last_setpoint[:] = position
         self.controller.reset(position, self.model.update_gravity(position), self.plant.motor_position)
         self.cold_start()
         for _ in range(round(self.config.controller.settle_s / CYCLE_S)):
@@ -142,6 +142,7 @@ class Cabinet:
     def _compile(self, scratch: ControllerModel) -> None:
         """Compile on the first run of a computer, before the PC waits for an answer."""
         scratch.update_model(self.reading.position)
+        scratch.flange(self.reading.position, np.empty(12))
         scratch.update_external(self.reading.position, self.reading.joint_torque, CYCLE_S)
         spring = PositionController(self.config.controller)
         spring.spring_cycle(self._zero, self._zero, self._zero, self._zero, self._zero)
@@ -155,7 +156,7 @@ class Cabinet:
         limits = KrcLimits(*(np.array(row) for row in rows))
         self.session = KrcSession(
             limits,
-            self._last_setpoint,
+            self.last_setpoint,
             self.config.policy,
             power=ALL_DRIVES if self.powered else 0,
             uptime_s=fri.uptime_s + self.milliseconds * CYCLE_S,
@@ -282,10 +283,10 @@ class Cabinet:
         if on:
             if session.state is not State.CMD:
                 session.resync(self.reading.position)
-            self._last_setpoint[:] = session.setpoint
+            self.last_setpoint[:] = session.setpoint
             self.controller.reset(
-                self._last_setpoint,
-                self.model.update_gravity(self._last_setpoint),
+                self.last_setpoint,
+                self.model.update_gravity(self.last_setpoint),
                 self.reading.motor_position,
             )
         self.report_drives()
@@ -302,18 +303,18 @@ class Cabinet:
         sample.msr_jnt_trq[:] = reading.joint_torque
         sample.est_ext_jnt_trq[:] = model.external_torque
         sample.gravity[:] = model.gravity
-        if self._model_age <= 0:
-            self._model_age = self.config.controller.model_period_ms
+        if self.model_age <= 0:
+            self.model_age = self.config.controller.model_period_ms
             model.update_model(position)
             sample.mass_matrix[:] = model.mass_matrix
             sample.jacobian[:] = model.jacobian
-            model.flange(self._last_setpoint, sample.cmd_cart_pos)
+            model.flange(self.last_setpoint, sample.cmd_cart_pos)
         model.flange(position, sample.msr_cart_pos)
         session = self.session
         commanding = session.state == State.CMD and session.power != 0
         if commanding and not self._commanding:
             self.monitor.period_s = session.sample_time_s
-            self.monitor.rest(self._last_setpoint, self.cycle - 1)
+            self.monitor.rest(self.last_setpoint, self.cycle - 1)
         self._commanding = commanding
         self.under_way = True
         self.packets += 1
@@ -339,11 +340,11 @@ class Cabinet:
         for row in positions:
             self._millisecond(row)
         last = positions[-1]
-        still = bool((last == self._last_setpoint).all())
-        self._last_setpoint[:] = last
+        still = bool((last == self.last_setpoint).all())
+        self.last_setpoint[:] = last
         self._idle_cycles = self._idle_cycles + 1 if still else 0
         self.moving = self._idle_cycles * len(positions) < _STILL_MS
-        self._model_age -= len(positions)
+        self.model_age -= len(positions)
         period_s = len(positions) * CYCLE_S
         self.model.update_external(self.reading.position, self.reading.joint_torque, period_s)
         self._choose_law()
@@ -375,8 +376,8 @@ class Cabinet:
         if wanted is not self._law and not session.ramping:
             if self._law in _SOFT and session.state is not State.CMD:
                 session.resync(self.reading.position)
-                self._last_setpoint[:] = session.setpoint
-            position = self._last_setpoint
+                self.last_setpoint[:] = session.setpoint
+            position = self.last_setpoint
             controller.reset(position, self.model.update_gravity(position), self.reading.motor_position)
             self._law = wanted
             self.journal.say(f"control of the arm: {session.control.name}")
@@ -413,12 +414,68 @@ class Cabinet:
             effect.sense_motor(time_s, plant, reading)
         plant.step(torque)
         self.milliseconds += 1
+        self.publish(reading.motor_torque)
+        self.trace.millisecond(time_s, reading.motor_torque, reading.position)
+
+    def publish(self, motor_torque: np.ndarray) -> None:
+        """The measured motor torque of a millisecond, to the KRL program or to the loop that stands for one."""
         if self.program_name not in PUBLISHED:
             if self.currents is not None:
-                self.currents = self.krl_reals.late(reading.motor_torque)
+                self.currents = self.krl_reals.late(motor_torque)
         elif self.config.krl_reals.enabled:
-            self.krl_reals.millisecond(reading.motor_torque, self.session.to_real, self.session.to_int)
-        self.trace.millisecond(time_s, reading.motor_torque, reading.position)
+            self.krl_reals.millisecond(motor_torque, self.session.to_real, self.session.to_int)
+
+    def idle_cycles(self, period_ms: int) -> int:
+        """Cycles to come in which no statement of KRL is due and no variable is published."""
+        idle = 10**6 if self.interpreter is None else self.interpreter.idle_cycles(period_ms)
+        if self._publishing:
+            idle = min(idle, self.krl_reals.idle_ms // period_ms)
+        return idle
+
+    def skip_cycles(self, count: int, period_ms: int) -> None:
+        """Pass over idle cycles."""
+        if self.interpreter is not None:
+            self.interpreter.skip(count * period_ms)
+        if self._publishing:
+            self.krl_reals.skip(count * period_ms)
+
+    @property
+    def _publishing(self) -> bool:
+        return self.program_name in PUBLISHED and self.config.krl_reals.enabled
+
+    @property
+    def ordinary(self) -> bool:
+        """Whether the arm is driven in position control and nothing else goes on, see `sim_backend.ahead`."""
+        plant, trace, interpreter = self.plant, self.config.trace, self.interpreter
+        return (
+            type(plant) is ElasticArm
+            and not (self.effects or plant.effects or plant.pushed)
+            and self.powered
+            and self._commanding
+            and not self.under_way
+            and self._law is Control.POSITION
+            and not (self.trace.recording or trace.delay_ms or self.config.krl_reals.delay_ms)
+            and (interpreter is None or not interpreter.moving)
+        )
+
+    def pass_cycles(self, count: int, milliseconds: int) -> None:
+        """Count `count` cycles worked out elsewhere, and let the KRL program run at the end of the last of them."""
+        self.milliseconds += count * milliseconds
+        self.cycle += count - 1
+        self._run_program(milliseconds)
+        self.cycle += 1
+
+    def settle(self, ends: np.ndarray, sequence: bytes) -> None:
+        """Note the cycles passed so. ends : setpoints at their ends, (m, 7) [rad]; sequence : of the last packet."""
+        count = len(ends)
+        self.packets += count
+        self.received += count
+        self._sequence = sequence
+        still = (ends == np.concatenate([self.last_setpoint[np.newaxis], ends[:-1]])).all(axis=1)
+        moved = np.flatnonzero(~still)
+        self._idle_cycles = self._idle_cycles + count if not len(moved) else count - 1 - int(moved[-1])
+        self.last_setpoint[:] = ends[-1]
+        self.moving = self._idle_cycles * self.session.sample_time_ms < _STILL_MS
 
 
 def _turn(a: float, b: float, c: float) -> np.ndarray:

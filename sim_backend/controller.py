@@ -26,13 +26,15 @@ import numpy as np
 import pinocchio as pin
 from numba import njit
 
+from fri.errors import ConfigurationError
+from sim_backend import bodies
 from sim_backend.configuration import ControllerConfig, LoadData
 from sim_backend.plant import CYCLE_S
 from sim_backend.robot import Payload, with_payload
 
 
 @njit(cache=True)
-def _feedback(setpoint, gravity, motor_position, joint_torque, gains, memory, settings, out):  # type: ignore[no-untyped-def]
+def feedback(setpoint, gravity, motor_position, joint_torque, gains, memory, settings, out):  # type: ignore[no-untyped-def]
     """One cycle of the law above.
 
     gains : rows K, Kp, Kd, Kt, viscous, Coulomb, limit. memory : rows theta_d, theta, theta_d' and theta'
@@ -66,7 +68,7 @@ def _impedance(  # type: ignore[no-untyped-def]
 ):
     """One cycle of the spring law.
 
-    spring : rows K [Nm/rad], D [Nm s/rad], tau_add [Nm]. gains, memory : as in `_feedback`
+    spring : rows K [Nm/rad], D [Nm s/rad], tau_add [Nm]. gains, memory : as in `feedback`
     settings : cycle [s], filter constant of the measured speed, Coulomb speed, torque gain
     """
     cycle, keep, slow, feedback = settings[0], settings[1], settings[2], settings[3]
@@ -87,7 +89,7 @@ def _impedance(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _external(joint_torque, bias, mass, change, keep, estimate):  # type: ignore[no-untyped-def]
+def external(joint_torque, bias, mass, change, keep, estimate):  # type: ignore[no-untyped-def]
     """Low-pass of `joint_torque - mass @ change - bias` into `estimate`."""
     for i in range(estimate.shape[0]):
         modelled = bias[i]
@@ -97,13 +99,38 @@ def _external(joint_torque, bias, mass, change, keep, estimate):  # type: ignore
 
 
 @njit(cache=True)
-def _difference(position: np.ndarray, period: float, keep: float, memory: np.ndarray) -> None:
+def difference(position: np.ndarray, period: float, keep: float, memory: np.ndarray) -> None:
     """Filtered speed and its rate. memory : rows position before, speed, acceleration."""
     for i in range(position.shape[0]):
         speed = keep * memory[1, i] + (1.0 - keep) * (position[i] - memory[0, i]) / period
         memory[2, i] = (speed - memory[1, i]) / period
         memory[1, i] = speed
         memory[0, i] = position[i]
+
+
+@njit(cache=True)
+def differences(positions, period, keep, memory, memories):  # type: ignore[no-untyped-def]
+    """`difference` for the positions (m, n) of successive cycles; `memories` (m, 3, n) keeps the memory after each."""
+    for k in range(positions.shape[0]):
+        difference(positions[k], period, keep, memory)
+        memories[k] = memory
+
+
+@njit(cache=True)
+def externals(chain, positions, joint_torques, masses, memories, keep, estimate, estimates):  # type: ignore[no-untyped-def]
+    """`external` for successive cycles; `estimates` (m, n) keeps the estimate after each."""
+    bias = np.empty(estimate.shape[0])
+    for k in range(joint_torques.shape[0]):
+        bodies.torques(chain, positions[k], memories[k, 1], bias)
+        external(joint_torques[k], bias, masses[k], memories[k, 2], keep, estimate)
+        estimates[k] = estimate
+
+
+@njit(cache=True)
+def poses(chain, positions, out):  # type: ignore[no-untyped-def]
+    """Poses of the flange (m, 12) at positions (m, n)."""
+    for k in range(positions.shape[0]):
+        bodies.pose(chain, positions[k], out[k])
 
 
 def _keep(cutoff_hz: float, period_s: float = CYCLE_S) -> float:
@@ -119,7 +146,7 @@ class PositionController:
     """State feedback on the motors, for position or for a spring; arrays are (n,) float64."""
 
     def __init__(self, config: ControllerConfig) -> None:
-        self._gains = np.array(
+        self.gains = np.array(
             [
                 config.stiffness,
                 config.position_gain,
@@ -130,7 +157,7 @@ class PositionController:
                 config.torque_limit,
             ]
         )
-        self._settings = np.array(
+        self.settings = np.array(
             [CYCLE_S, _keep(config.command_cutoff_hz), _keep(config.velocity_cutoff_hz), config.coulomb_speed]
         )
         self._impedance = np.array(
@@ -143,29 +170,29 @@ class PositionController:
         )
         self._inertia = np.array(config.motor_inertia) / (1.0 + config.impedance_torque_gain)
         self._free_damping = np.array(config.free_damping)
-        self._memory = np.zeros((4, self._gains.shape[1]))
-        self._spring = np.zeros((3, self._gains.shape[1]))
-        self.torque = np.zeros(self._gains.shape[1])
+        self.memory = np.zeros((4, self.gains.shape[1]))
+        self._spring = np.zeros((3, self.gains.shape[1]))
+        self.torque = np.zeros(self.gains.shape[1])
 
     def reset(self, setpoint: np.ndarray, gravity: np.ndarray, motor_position: np.ndarray) -> None:
         """Begin from rest."""
-        self._memory[0] = setpoint + gravity / self._gains[0]
-        self._memory[1] = motor_position
-        self._memory[2:] = 0.0
+        self.memory[0] = setpoint + gravity / self.gains[0]
+        self.memory[1] = motor_position
+        self.memory[2:] = 0.0
         self.torque[:] = 0.0
 
     def cycle(
         self, setpoint: np.ndarray, gravity: np.ndarray, motor_position: np.ndarray, joint_torque: np.ndarray
     ) -> np.ndarray:
         """Motor torque of the coming millisecond, referred to the joint [Nm]; the array is reused."""
-        _feedback(
+        feedback(
             setpoint,
             gravity,
             motor_position,
             joint_torque,
-            self._gains,
-            self._memory,
-            self._settings,
+            self.gains,
+            self.memory,
+            self.settings,
             self.torque,
         )
         return self.torque
@@ -202,8 +229,8 @@ class PositionController:
             motor_position,
             joint_torque,
             self._spring,
-            self._gains,
-            self._memory,
+            self.gains,
+            self.memory,
             self._impedance,
             self.torque,
         )
@@ -224,12 +251,12 @@ class ControllerModel:
         self._bare = model
         self._frame = model.getFrameId(flange) if model.existFrame(flange) else model.nframes - 1
         n = model.nv
-        self.gravity = np.zeros(n)
+        self.gravity, self._rest = np.zeros(n), np.zeros(n)
         self.mass_matrix = np.zeros((n, n))
         self.jacobian = np.zeros((6, n))
         self.external_torque = np.zeros(n)
         self._cutoff_hz = external_cutoff_hz
-        self._memory = np.zeros((3, n))
+        self.memory = np.zeros((3, n))
         self._begun = False
         self.gravitation: tuple[float, float, float] = (0.0, 0.0, 9.81)
         self.set_load(load)
@@ -246,33 +273,46 @@ class ControllerModel:
         body = Payload.from_centre_of_mass(load.mass, load.com, load.inertia) if load.mass > 0.0 else None
         self.model = with_payload(self._bare, body)
         self._data = self.model.createData()
+        frame = self.model.frames[self._frame]
+        if frame.parentJoint != self.model.njoints - 1:
+            raise ConfigurationError(
+                f"frame {frame.name!r} of the controller's model is not on the last link"
+            )
+        self.chain = bodies.chain_of(self.model, frame.placement)
 
     def update_gravity(self, position: np.ndarray) -> np.ndarray:
         """Gravity torque at `position` (n,) [Nm]; a new array."""
-        self.gravity = pin.computeGeneralizedGravity(self.model, self._data, position)
+        self.gravity = np.empty(self.gravity.size)
+        bodies.torques(self.chain, position, self._rest, self.gravity)
         return self.gravity
 
     def update_model(self, position: np.ndarray) -> None:
         """Mass matrix and Jacobian at `position`."""
-        self.mass_matrix = pin.crba(self.model, self._data, position)
+        self.mass_matrix, self.jacobian[:] = self.model_at(position)
+
+    def model_at(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same without keeping them."""
+        mass_matrix = pin.crba(self.model, self._data, position).copy(order="K")
         jacobian = pin.computeFrameJacobian(
             self.model, self._data, position, self._frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         )
-        self.jacobian[:3] = jacobian[:3]
-        self.jacobian[3:] = jacobian[:2:-1]
+        return mass_matrix, np.concatenate([jacobian[:3], jacobian[:2:-1]])
+
+    def keep(self, period_s: float) -> float:
+        """Weight of the old value in the filter of the external torque, per cycle."""
+        return _keep(self._cutoff_hz, period_s)
 
     def update_external(self, position: np.ndarray, joint_torque: np.ndarray, period_s: float) -> None:
         """Estimated external torque: measured joint torque minus the model, low-pass filtered."""
         if not self._begun:
-            self._memory[0] = position
+            self.memory[0] = position
             self._begun = True
-        keep, memory = _keep(self._cutoff_hz, period_s), self._memory
-        _difference(position, period_s, keep, memory)
-        bias = pin.nonLinearEffects(self.model, self._data, position, memory[1])
-        _external(joint_torque, bias, self.mass_matrix, memory[2], keep, self.external_torque)
+        keep, memory = self.keep(period_s), self.memory
+        difference(position, period_s, keep, memory)
+        bias = np.empty(position.size)
+        bodies.torques(self.chain, position, memory[1], bias)
+        external(joint_torque, bias, self.mass_matrix, memory[2], keep, self.external_torque)
 
     def flange(self, position: np.ndarray, out: np.ndarray) -> None:
         """Pose of the flange in the base frame into `out` (12,), 3x4 row-major [R | p]."""
-        pin.forwardKinematics(self.model, self._data, position)
-        pose = pin.updateFramePlacement(self.model, self._data, self._frame)
-        out[:] = pose.homogeneous[:3].reshape(12)
+        bodies.pose(self.chain, position, out)

@@ -65,6 +65,17 @@ def _judge(command, time_s, times, values, middle, limits, worst, ratio, violati
     return count
 
 
+@njit(cache=True)
+def _judge_rows(commands, cycle, period_s, times, values, middle, limits, worst, ratio, violations):  # type: ignore[no-untyped-def]
+    """`_judge` for commands of successive cycles, up to the first with a violation; how many, and whether one has."""
+    for k in range(commands.shape[0]):
+        if _judge(
+            commands[k], (cycle + k) * period_s, times, values, middle, limits, worst, ratio, violations
+        ):
+            return k + 1, True
+    return commands.shape[0], False
+
+
 class CommandMonitor:
     """Worst values per joint since the last `reset`.
 
@@ -119,6 +130,28 @@ class CommandMonitor:
         )
         if broken and self.first_violation is None:
             self.first_violation = self._describe(cycle)
+
+    def take_rows(self, commands: np.ndarray, cycle: int) -> None:
+        """As `take` for commands (m, 7) float32 of the cycles from `cycle` on, if one was taken before."""
+        done = 0
+        while done < len(commands):
+            some = commands[done:]
+            count, broken = _judge_rows(
+                some,
+                cycle + done,
+                self.period_s,
+                self._times,
+                self._values,
+                self._middle,
+                self._limits,
+                self.worst,
+                self.ratio,
+                self.violations,
+            )
+            done += count
+            if broken and self.first_violation is None:
+                self.first_violation = self._describe(cycle + done - 1)
+        self.commands += len(commands)
 
     def _describe(self, cycle: int) -> str:
         row, joint = (int(i) for i in np.unravel_index(np.argmax(self.ratio), self.ratio.shape))

@@ -98,6 +98,12 @@ class Operator:
         return self.cabinet.mode
 
     @property
+    def idle(self) -> bool:
+        """Whether `step` would do nothing, whatever the cycle."""
+        waiting = self._silent_since, self._silent_until, self._restart_at, self._ceiling_until
+        return not self._pending and all(until is None for until in waiting)
+
+    @property
     def silent(self) -> bool:
         """Whether the controller sends nothing although a session is open."""
         return self._silent_since is not None and self.cabinet.cycle >= self._silent_since

@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numba import njit
 
+from sim_backend import bodies
 from sim_backend.robot import Drive, Payload, with_payload
 from sim_backend.stiction import advance
 
@@ -101,7 +102,7 @@ class PlantEffect:
 
 
 @njit(cache=True)
-def _predict(position, velocity, before, half, middle):  # type: ignore[no-untyped-def]
+def predict(position, velocity, before, half, middle):  # type: ignore[no-untyped-def]
     """Position and velocity after `half` a cycle [s], from the velocities now and a cycle before.
 
     Evaluating the link equations there makes them second order. `before` takes the velocity of now.
@@ -113,7 +114,7 @@ def _predict(position, velocity, before, half, middle):  # type: ignore[no-untyp
 
 
 class ElasticArm:
-    """Two masses per joint (see `stiction`), rigid links and payload by pinocchio.
+    """Two masses per joint (see `stiction`), rigid links and payload (see `bodies`).
 
     The mass matrix and the gravity, centrifugal and Coriolis torques are evaluated once per cycle, at its
     extrapolated midpoint; the joints advance in `substeps` steps within the cycle.
@@ -143,17 +144,18 @@ class ElasticArm:
         self.motor_torque = np.zeros(n)
         self.payload: Payload | None = None
         self.effects = tuple(effects)
-        self._modes = np.zeros((2, n), dtype=np.int64)
-        self._joint = np.array([drive.Ia, drive.stiffness, drive.damping], dtype=float)
+        self.modes = np.zeros((2, n), dtype=np.int64)
+        self.joint = np.array([drive.Ia, drive.stiffness, drive.damping], dtype=float)
         self._nominal = np.array(
             [drive.Fvm, drive.Fcm, drive.offm, drive.Fvl, drive.Fcl, drive.offl], dtype=float
         )
-        self._friction = self._nominal.copy()
+        self.friction = self._nominal.copy()
         self._push = np.zeros(n)
-        self._pushed = False
-        self._last_velocity = np.zeros(n)
+        self.pushed = False
+        self.last_velocity = np.zeros(n)
         self._middle = np.zeros((2, n))
-        self.loads = Loads(np.zeros(n), np.zeros(n), *self._friction)
+        self._mass, self._bias = np.zeros((n, n)), np.zeros(n)
+        self.loads = Loads(np.zeros(n), np.zeros(n), *self.friction)
         streams = (random or np.random.SeedSequence(0)).spawn(len(self.effects))
         for effect, stream in zip(self.effects, streams, strict=True):
             effect.start(n, np.random.default_rng(stream))
@@ -163,18 +165,19 @@ class ElasticArm:
     def _use(self, model: pin.Model) -> None:
         self.model = model
         self._data = model.createData()
+        self.chain = bodies.chain_of(model)
 
     def reset(self, position: np.ndarray) -> None:
         """Links at rest at `position` (n,), with gravity and offset carried by the torsion of the joints."""
         self.position[:] = position
         self.velocity[:] = 0.0
         self.motor_velocity[:] = 0.0
-        self._last_velocity[:] = 0.0
+        self.last_velocity[:] = 0.0
         load = pin.computeGeneralizedGravity(self.model, self._data, self.position) + self._nominal[5]
         load -= self._push
-        self.motor_position[:] = self.position + load / self._joint[1]
-        self._modes[:] = 0
-        self.joint_torque[:] = self._joint[1] * (self.motor_position - self.position)
+        self.motor_position[:] = self.position + load / self.joint[1]
+        self.modes[:] = 0
+        self.joint_torque[:] = self.joint[1] * (self.motor_position - self.position)
 
     def mount(self, payload: Payload | None) -> None:
         """Weld `payload` to the last link; the links settle at rest, the motors stay."""
@@ -182,35 +185,36 @@ class ElasticArm:
         self._use(with_payload(self.bare, payload))
         self.velocity[:] = 0.0
         self.motor_velocity[:] = 0.0
-        self._last_velocity[:] = 0.0
+        self.last_velocity[:] = 0.0
         for _ in range(50):
             load = pin.computeGeneralizedGravity(self.model, self._data, self.position) + self._nominal[5]
-            self.position[:] = self.motor_position - (load - self._push) / self._joint[1]
-        self.joint_torque[:] = self._joint[1] * (self.motor_position - self.position)
+            self.position[:] = self.motor_position - (load - self._push) / self.joint[1]
+        self.joint_torque[:] = self.joint[1] * (self.motor_position - self.position)
 
     def brake(self, engaged: bool) -> None:
         """The brakes add their torque to the motor-side Coulomb friction, so they hold without drift."""
         self._nominal[1] = self.drive.Fcm + (self.drive.brake_torque if engaged else 0.0)
-        self._friction[:] = self._nominal
+        self.friction[:] = self._nominal
 
     def push(self, torque: np.ndarray) -> None:
         """External torque (n,) on the links [Nm], until changed."""
         self._push[:] = torque
-        self._pushed = bool(np.any(self._push))
+        self.pushed = bool(np.any(self._push))
 
     def step(self, motor_torque: np.ndarray) -> None:
         """Advance by one cycle under the motor torque (n,) [Nm], held."""
         self.motor_torque[:] = motor_torque
         middle, middle_velocity = self._middle
-        _predict(self.position, self.velocity, self._last_velocity, 0.5 * self.cycle_s, self._middle)
-        mass = pin.crba(self.model, self._data, middle)
-        bias = pin.nonLinearEffects(self.model, self._data, middle, middle_velocity)
+        predict(self.position, self.velocity, self.last_velocity, 0.5 * self.cycle_s, self._middle)
+        mass, bias = self._mass, self._bias
+        bodies.mass_matrix(self.chain, middle, mass)
+        bodies.torques(self.chain, middle, middle_velocity, bias)
         drive_torque = self.motor_torque
-        if self.effects or self._pushed:
+        if self.effects or self.pushed:
             loads = self.loads
             loads.motor_torque[:] = 0.0
             loads.link_torque[:] = self._push
-            self._friction[:] = self._nominal
+            self.friction[:] = self._nominal
             time_s = self.cycles * self.cycle_s
             for effect in self.effects:
                 effect.load(time_s, self, loads)
@@ -218,12 +222,12 @@ class ElasticArm:
             drive_torque = self.motor_torque + loads.motor_torque
         self.descents += advance(
             self.state,
-            self._modes,
+            self.modes,
             mass,
             bias,
             drive_torque,
-            self._joint,
-            self._friction,
+            self.joint,
+            self.friction,
             self.cycle_s,
             self.substeps,
             self.joint_torque,

@@ -25,7 +25,7 @@ def _quantise(value: float, step: float) -> float:
 
 
 @njit(cache=True)
-def _read(position, motor_position, joint_torque, settings, noise, reading):  # type: ignore[no-untyped-def]
+def read(position, motor_position, joint_torque, settings, noise, reading):  # type: ignore[no-untyped-def]
     """Rows of `reading`: position, motor position, joint torque."""
     for i in range(position.shape[0]):
         reading[0, i] = _quantise(position[i] + settings[1, i] * noise[0, i], settings[0, i])
@@ -35,7 +35,7 @@ def _read(position, motor_position, joint_torque, settings, noise, reading):  # 
 
 
 @njit(cache=True)
-def _read_motor(before, after, settings, noise, reading):  # type: ignore[no-untyped-def]
+def read_motor(before, after, settings, noise, reading):  # type: ignore[no-untyped-def]
     """Row 3 of `reading`: motor torque at the instant between the milliseconds of `before` and `after`."""
     for i in range(before.shape[0]):
         torque = 0.5 * (before[i] + after[i]) + settings[6, i] * noise[2, i]
@@ -51,9 +51,9 @@ class Sensors:
     """
 
     def __init__(self, config: SensorConfig, joints: int, random: np.random.SeedSequence) -> None:
-        self._link_side = config.position_sensor == "link"
+        self.link_side = config.position_sensor == "link"
         self._streams = [np.random.default_rng(stream) for stream in random.spawn(3)]
-        self._settings = np.array(
+        self.settings = np.array(
             [
                 config.position_resolution,
                 config.position_noise,
@@ -65,27 +65,36 @@ class Sensors:
                 config.motor_torque_resolution,
             ]
         )
-        self._rows = np.zeros((4, joints))
+        self.rows = np.zeros((4, joints))
         self._noise = np.zeros((_BLOCK, 3, joints))
         self._next = _BLOCK
         self._row = self._noise[0]
-        self.reading = Reading(*self._rows)
+        self.reading = Reading(*self.rows)
 
     def read(self, plant: Plant) -> Reading:
         """Position, motor position and joint torque at this instant; the motor torque is still the last."""
+        self._row = self.noise(1)[0]
+        self._next += 1
+        position = plant.position if self.link_side else plant.motor_position
+        read(position, plant.motor_position, plant.joint_torque, self.settings, self._row, self.rows)
+        return self.reading
+
+    def noise(self, most: int) -> np.ndarray:
+        """Noise of the next readings, one row each, up to `most` rows (m, 3, n); `skip` takes them."""
         if self._next == _BLOCK:
             for row, stream in enumerate(self._streams):
                 self._noise[:, row] = stream.standard_normal(self._noise.shape[::2])
             self._next = 0
-        self._row = self._noise[self._next]
-        self._next += 1
-        position = plant.position if self._link_side else plant.motor_position
-        _read(position, plant.motor_position, plant.joint_torque, self._settings, self._row, self._rows)
-        return self.reading
+        return self._noise[self._next : self._next + most]
+
+    def skip(self, count: int) -> None:
+        """Readings taken elsewhere, with the noise of `noise`."""
+        self._next += count
+        self._row = self._noise[self._next - 1]
 
     def read_motor(self, before: np.ndarray, after: np.ndarray) -> None:
         """Motor torque at this instant, from the torques (n,) of the milliseconds before and after it."""
-        _read_motor(before, after, self._settings, self._row, self._rows)
+        read_motor(before, after, self.settings, self._row, self.rows)
 
 
 def trace_columns(joint_names: tuple[str, ...]) -> tuple[str, ...]:
@@ -97,12 +106,12 @@ class _Delay:
     """Last values of a vector, to be read some milliseconds late."""
 
     def __init__(self, milliseconds: int, size: int) -> None:
-        self._rows = np.zeros((milliseconds + 1, size))
+        self.rows = np.zeros((milliseconds + 1, size))
         self._next = 0
 
     def put(self, values: np.ndarray) -> np.ndarray:
         """Take in `values` (size,), return those of `milliseconds` ago; do not keep them."""
-        rows = self._rows
+        rows = self.rows
         if len(rows) == 1:
             return values
         rows[self._next] = values
@@ -132,6 +141,15 @@ class KrlReals:
         self._count = (self._count + 1) & 0x7FFFFFFF
         to_real[self._indices] = late
         to_int[self._counter] = self._count
+
+    @property
+    def idle_ms(self) -> int:
+        """Milliseconds to come before the next tick; `skip` passes over some of them."""
+        return self.config.tick_ms - self._elapsed - 1
+
+    def skip(self, milliseconds: int) -> None:
+        """Milliseconds without a tick; without a delay only."""
+        self._elapsed += milliseconds
 
     def late(self, motor_torque: np.ndarray) -> np.ndarray:
         """Take in `motor_torque` (7,), return the one of `delay_ms` ago; do not keep it."""

@@ -10,10 +10,14 @@ import socket
 import time
 from collections.abc import Callable
 
+import numpy as np
+
 from fri.controller_end import ControllerEnd
 from fri.in_process import Network, Port
+from fri.packets import CMD
 from fri.states import State
 from lwr_driver.hosted_loop import Seat
+from sim_backend.ahead import CabinetAhead, prepare
 from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import EmulatorConfig
 from sim_backend.faults import FaultyWire, Parcel
@@ -32,6 +36,8 @@ _TURN_S = 0.0005  # pause between the turns of an idle loop
 _PERHAPS_S = 0.02
 _PACED_AFTER = 2000
 _PENDANT_EVERY = 50
+_MANY = 250  # most cycles at once: the pendant and requests of the driver wait for so long
+_NO_COMMANDS = np.zeros(0, CMD)
 
 
 class Service:
@@ -58,6 +64,8 @@ class Service:
         self.operator = Operator(self.cabinet, self.wire)
         self._network = None if seat is None else Network()
         self._seat = None if seat is None or self._network is None else Seat(seat, self._network)
+        if seat is not None:
+            prepare(self.cabinet)
         self.end = ControllerEnd(remote, (config.fri.local_host, config.fri.local_port), self._network)
         self.pendant = PendantServer(pendant_port, self.operator.handle)
         self._foreign: dict[str, socket.socket | Port] = {}
@@ -159,6 +167,8 @@ class Service:
 
     def _lock_step(self) -> None:
         cabinet, operator = self.cabinet, self.operator
+        if self._seat is not None and self._many(self._seat):
+            return
         if cabinet.session.state is State.OFF or operator.silent:
             self._silent_cycle()
             return
@@ -174,6 +184,35 @@ class Service:
         if self.running:
             cabinet.close()
             operator.step()
+
+    def _many(self, seat: Seat) -> bool:
+        """Many ordinary cycles of a motion at once, with the loop of the driver in this process; False without any.
+
+        Each ends with both sides as after as many single cycles. What is not ordinary is left to a single cycle.
+        """
+        cabinet, operator, end = self.cabinet, self.operator, self.end
+        if not cabinet.ordinary or not self._undisturbed():
+            return False
+        self._look(0.0)
+        age_s = self.config.fri.answer_delay_s
+        commands = seat.offer(_MANY) if self._undisturbed() and self.running else _NO_COMMANDS
+        ahead = CabinetAhead.of(cabinet, commands, age_s) if len(commands) else None
+        if ahead is None:
+            return False
+        commands = commands[: len(ahead.packets)]
+        accepted = seat.accept(ahead.packets, commands)
+        if accepted == 0:
+            return False
+        done = ahead.take(accepted)
+        seat.take(ahead.packets[:done], commands[:done])
+        self._last_head = commands[done - 1 : done].tobytes()[:4]
+        self._heard_s, self._refused, self._impatient = time.monotonic(), end.refused, False
+        operator.step()
+        return True
+
+    def _undisturbed(self) -> bool:
+        """Whether nothing else acts on the next cycles: no fault, no datagram, no action of the operator."""
+        return self.wire.quiet and self.operator.idle and not (self._absent or self.end.waiting)
 
     def _silent_cycle(self) -> None:
         """A cycle without a packet; time stands still unless the operator is busy."""

@@ -185,15 +185,15 @@ class Bench:
 
     def judge(self, run: Run, until_ms: int, since_ms: int, joint: int) -> None:
         """Cycles up to the end of the motion and until `until_ms`; what happens goes into `run`."""
-        cabinet, loop, last = self.cabinet, self.loop, self.cabinet._last_setpoint.copy()
+        cabinet, loop, last = self.cabinet, self.loop, self.cabinet.last_setpoint.copy()
         while cabinet.milliseconds < until_ms and not (run.decided is None and self.control.done):
             now = cabinet.milliseconds
             self.cycle()
             if run.decided is None and loop.mode is Mode.STOP:
                 run.decided = now - since_ms
-            if np.abs(cabinet._last_setpoint - last).max() > _STILL_RAD:
+            if np.abs(cabinet.last_setpoint - last).max() > _STILL_RAD:
                 run.rest = now - since_ms
-            last = cabinet._last_setpoint.copy()
+            last = cabinet.last_setpoint.copy()
             run.left = abs(float(self.forces[joint]))
             run.peak = max(run.peak, run.left)
             run.share = max(run.share, float((np.abs(cabinet.plant.joint_torque) / self.arm.tau_max).max()))

@@ -752,3 +752,22 @@ def test_the_clock_goes_on_while_the_session_is_closed():
     for _ in range(5):
         rig.session.close_cycle()
     assert rig.session.timestamp_s == pytest.approx(0.004 * 8)
+
+
+@pytest.mark.parametrize("joint", [0, 3, 6])
+@pytest.mark.parametrize("value", [0.0, 0.01, 10.0, np.nan, np.inf])
+def test_commands_ahead_are_judged_as_single_ones(joint, value):
+    rig = Rig().command_mode()
+    accelerate(rig, 5, np.full(7, 1e-4))
+    rows = rig.session.setpoint + np.arange(1, 9)[:, np.newaxis] * 1e-4
+    rows = rows.astype(np.float32)
+    rows[4, joint] += value
+    judge = rig.session._judge
+    passed = judge.pass_rows(rows.astype(float), rig.session.setpoint)
+    assert passed == (4 if not value < 0.0001 else 8)
+    held = rig.session.setpoint
+    for number, row in enumerate(rows[: passed + 1]):
+        rig.session._command.jnt_pos[:] = row
+        objection = judge.position(row.tolist(), "commanded") or judge.velocity(rig.session._command, held)
+        assert (objection is None) == (number < passed)
+        held = row.astype(float)

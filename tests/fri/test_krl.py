@@ -260,3 +260,24 @@ def test_unknown_program_is_named_with_the_known_ones():
     assert sorted(HANDSHAKES) == NAMES
     with pytest.raises(ConfigurationError, match=r"known are lwr_id.*, rcprg, ros_control, stanford"):
         find_handshake("kuka")
+
+
+@pytest.mark.parametrize("statement_ms", [0.0, 0.1, 0.7, 5.0])
+@pytest.mark.parametrize("period_ms", [1, 5, 12])
+def test_idle_cycles_are_those_without_a_statement(statement_ms, period_ms):
+    made = [KrlProgram(COUNTING, name="p", statement_ms=statement_ms) for _ in range(2)]
+    stepped, skipped = (Interpreter(Rig().session, program) for program in made)
+    now = 0
+    while now < 200:
+        idle = skipped.idle_cycles(period_ms)
+        skipped.skip(idle * period_ms)
+        skipped.advance(period_ms)
+        for cycle in range(idle + 1):
+            before, due_ms = stepped.session.to_int.copy(), stepped.program.due_ms
+            stepped.advance(period_ms)
+            if cycle < idle:
+                assert np.array_equal(stepped.session.to_int, before)
+                assert stepped.program.due_ms == due_ms
+        now += idle + 1
+        assert skipped.program.due_ms == stepped.program.due_ms
+        assert np.array_equal(skipped.session.to_int, stepped.session.to_int)

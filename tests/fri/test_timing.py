@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -157,3 +159,20 @@ def test_limits_are_copies_that_cannot_be_changed():
         KrcLimits(-limits.q_max, limits.q_max, limits.v_max, np.zeros(7))
     with pytest.raises(ConfigurationError, match="A1 q_min"):
         KrcLimits(limits.q_max, limits.q_max, limits.v_max, limits.v_max)
+
+
+def test_a_steady_window_stays_as_it_is():
+    statistics = AnswerStatistics(4)
+    for latency in (100, 200, 200, 200):
+        statistics.close(latency)
+        assert not statistics.steady(200)
+    statistics.close(200)
+    assert statistics.steady(200)
+    assert not statistics.steady(100)
+    twin = copy.deepcopy(statistics)
+    statistics.repeat(6)
+    for _ in range(6):
+        twin.close(200)
+    assert vars(statistics) == vars(twin)
+    statistics.close(None)
+    assert not statistics.steady(200)

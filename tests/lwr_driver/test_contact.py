@@ -334,3 +334,50 @@ def test_a_lowered_threshold_finds_a_smaller_push():
     assert not any(follow(watch(), q, tau)[0])
     found, _ = follow(watch(ContactSettings(external_nm=(6.0, *EXTERNAL_NM[1:]))), q, tau)
     assert any(contact is not None and contact.joint == 0 for contact in found)
+
+
+@pytest.mark.parametrize("kind", ["plain", "contact", "jump", "repeated", "not a number"])
+@pytest.mark.parametrize("friction", [0.0, 3.0])
+@pytest.mark.parametrize("weight", [False, True])
+def test_many_packets_are_watched_as_single_ones(kind, friction, weight):
+    q, qd, qdd = swing(1e-3, 0.4)
+    tau = torques(model(), q, qd, qdd)
+    tau += friction * (qd + np.clip(qd / 0.02, -1.0, 1.0) + 1.0)
+    rest = 0.0 * q
+    gravity = torques(model(LOAD), q, rest, rest) * weight
+    tau += (gravity - torques(model(), q, rest, rest)) * weight
+    at = 300
+    if kind == "contact":
+        tau[at:, 1] -= 200.0
+    elif kind == "jump":
+        q[at, 2] += 0.1
+    elif kind == "repeated":
+        q[at] = q[at - 1]
+    elif kind == "not a number":
+        tau[at, 4] = np.nan
+    seven, nominal = (friction,) * 7, ExpectedArm.nominal(arm())
+    expected = ExpectedArm(nominal.dynamics, seven, seven, seven, nominal.uncertainty)
+    single, many = (ContactWatch(expected, ContactSettings(), arm().tau_max) for _ in range(2))
+    columns = [column.astype(np.float32) for column in (q, tau, 0.0 * tau, gravity)]
+    for row in range(250):
+        for one in (single, many):
+            assert one.update(1, *(column[row] for column in columns)) is None
+    ahead = many.ahead(*(column[250:] for column in columns))
+    assert ahead.count == (len(q) - 250 if kind == "plain" else at - 250)
+    ahead.place(ahead.count)
+    for row in range(250, 250 + ahead.count):
+        assert single.update(1, *(column[row] for column in columns)) is None
+    for name in ("_last", "_step", "_state", "_open", "external", "allowed"):
+        assert getattr(many, name).tobytes() == getattr(single, name).tobytes(), name
+    for row in range(250 + ahead.count, len(q)):
+        found = [one.update(1, *(column[row] for column in columns)) for one in (single, many)]
+        assert str(found[0]) == str(found[1])
+
+
+def test_the_first_packets_are_left_to_single_ones():
+    q, qd, qdd = swing(1e-3, 0.05)
+    tau = torques(model(), q, qd, qdd).astype(np.float32)
+    made, nothing = watch(), np.zeros_like(tau)
+    assert made.ahead(q.astype(np.float32), tau, nothing, nothing).count == 0
+    made.update(1, q[0].astype(np.float32), tau[0], NOTHING, NOTHING)
+    assert made.ahead(q.astype(np.float32), tau, nothing, nothing).count == 0

@@ -282,3 +282,49 @@ def test_a_copy_goes_its_own_way():
     assert violation is not None
     assert violation.quantity == "velocity"
     assert watch.check(START.astype(np.float32), 1) is None
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    start=st.integers(0, 300),
+    count=st.integers(1, 60),
+    place=st.integers(0, 59),
+    joint=st.integers(0, 6),
+    jump=st.sampled_from([0.0, 1e-7, 1e-6, -2e-5, 0.01, np.nan, np.inf]),
+)
+def test_many_rows_pass_as_far_as_single_rows_do(start, count, place, joint, jump):
+    motion = move_to(arm(), START, moved(A1=0.3, A3=-0.2, A6=0.5).astype(float), T, speed_scale=1.0)
+    rows = motion.q.astype(np.float32)
+    start = min(start, len(rows) - 1)
+    single, many = guard(), guard()
+    for row in rows[:start]:
+        assert single.check(row, 1) is None
+        assert many.check(row, 1) is None
+    ahead = rows[start : start + count].copy()
+    if place < len(ahead):
+        ahead[place, joint] += np.float32(jump)
+    passed = many.check_rows(ahead)
+    verdicts = []
+    for row in ahead:
+        verdicts.append(single.check(row, 1))
+        if verdicts[-1] is not None:
+            break
+    good = sum(verdict is None for verdict in verdicts)
+    # Right after the beginning the roundings still change, and single checks are asked for.
+    assert passed == (good if start >= 2 else 0)
+    if passed:
+        many.remember_rows(ahead[:passed])
+        twin = guard()
+        for row in [*rows[:start], *ahead[:passed]]:
+            assert twin.check(row, 1) is None
+        for name in ("_q", "_v", "_a"):
+            assert getattr(many, name).tobytes() == getattr(twin, name).tobytes()
+
+
+def test_rows_after_a_gap_are_left_to_single_checks():
+    watch, rest = guard(), np.tile(START.astype(np.float32), (5, 1))
+    for _ in range(5):
+        assert watch.check(rest[0], 1) is None
+    assert watch.check_rows(rest) == 5
+    assert watch.check(rest[0], 2) is None
+    assert watch.check_rows(rest) == 0

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -163,3 +164,21 @@ def test_a_killed_creator_leaves_nothing_and_takes_nothing_from_those_who_attach
 def test_ring_of_one_row_is_refused():
     with pytest.raises(ConfigurationError, match="needs 2 at least"):
         Ring.create(1)
+
+
+@pytest.mark.parametrize("batches", [(3, 4, 1, 5), (7, 2, 6)])
+def test_rows_published_together_are_those_published_one_by_one(batches):
+    with Ring.create(8) as single, Ring.create(8) as many:
+        number = 0
+        for batch in batches:
+            rows = np.zeros(batch, dtype=ROW)
+            rows["sequence"] = number + np.arange(batch)
+            number += batch
+            many.publish_rows(rows)
+            for row in rows:
+                single.row[0] = row
+                assert single.publish()
+            assert many.head == single.head
+            assert many.take().tobytes() == single.take().tobytes() == rows.tobytes()
+            for ring in (single, many):
+                ring.release(batch)
