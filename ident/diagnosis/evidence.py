@@ -335,6 +335,8 @@ class Evidence:
 
     def replace(self, extra: Sequence[Rows]) -> None:
         """Replace the columns beyond the base."""
+        if [*map(id, extra)] == [*map(id, self.extra)]:
+            return
         self.extra = list(extra)
         self._joined.clear()
         for rows in self.extra:

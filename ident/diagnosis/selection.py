@@ -48,6 +48,8 @@ _HABITUAL = 3.0
 _SHAPE_ALONE = 0.7
 # Confidence in one of two causes of the same torque in these motions.
 _EITHER = 0.5
+# Latest sets of columns whose best shapes are kept.
+_LATEST = 6
 
 GAIN = "gain"
 """Name of the tolerated deviation of a torque sensor's gain, before the number of its joint."""
@@ -197,6 +199,7 @@ class _State:
     nuisance: dict[str, tuple[float, float]] = field(default_factory=dict)
     nuisance_rows: list[Rows] = field(default_factory=list)
     _tolerances: list[_Tolerance] | None = None
+    _latest: dict[tuple[int, ...], list[Trial]] = field(default_factory=dict)
 
     # ---- tolerated deviations ----
 
@@ -290,7 +293,17 @@ class _State:
         return sorted(found, key=_gain, reverse=True)
 
     def simplest(self) -> list[Trial]:
-        """Best shapes of all candidates, without those replaceable by a special case."""
+        """Best shapes of all candidates, without those replaceable by a special case; beside the same columns they
+        are the same."""
+        # The evidence keeps the columns, so their identity stays theirs.
+        beside = tuple(map(id, self.evidence.extra))
+        found = self._latest.pop(beside, None) or self._simplest()
+        self._latest[beside] = found
+        if len(self._latest) > _LATEST:
+            self._latest.pop(next(iter(self._latest)))
+        return found
+
+    def _simplest(self) -> list[Trial]:
         found = list(self.dictionary.trials())
         gain = {t.candidate.key: _gain(t) for t in found}
 

@@ -34,3 +34,29 @@ def test_two_causes_in_the_same_rows_do_not_compete(make: Callable[..., Session]
     ripple = trial("gear_ripple", cycles_per_turn=12.0, gear_ratio=1.0)
     assert ripple.score.gain > here.score.gain > 0.0
     assert state.competing(here, [ripple, other_form], []) == [other_form]
+
+
+def test_best_shapes_are_found_once_beside_the_same_columns_and_anew_beside_others(
+    make: Callable[..., Session], chain: Chain
+) -> None:
+    bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
+
+    def state() -> _State:
+        causes = bench.dictionary.of(["stribeck", "gear_ripple"])
+        return _State(causes, bench.evidence, DiagnosisSettings(), {})
+
+    one, other = state(), state()
+    one.tolerate([])
+    alone = one.simplest()
+    one.tolerate(alone[:1])
+    beside = one.simplest()
+    one.tolerate([])
+    assert one.simplest() is alone
+    for accepted, found in (([], alone), (alone[:1], beside)):
+        other.tolerate(accepted)
+        again = other.simplest()
+        assert again is not found
+        assert [t.candidate.key for t in again] == [t.candidate.key for t in found]
+        assert [t.score.gain for t in again] == [t.score.gain for t in found]
+    shared = {t.candidate.key: t.score.gain for t in alone}
+    assert any(t.score.gain != shared[t.candidate.key] for t in beside if t.candidate.key in shared)
