@@ -313,26 +313,27 @@ class KrlProgram:
 
     def _block(self, statements: tuple[tree.Statement, ...]) -> Flow:
         """Run statements; the result is EXIT or RETURN if one of them ended the block, else empty."""
-        for step in self._steps(statements):
-            self._line = step.line
-            if not step.plain and (due := self._spend()) is not None:
+        for line, plain, act, choose, statement in self._steps(statements):
+            self._line = line
+            if not plain and (due := self._spend()) is not None:
                 yield due
-            if step.act is not None:
-                left = step.act()
-            elif step.choose is not None:
-                left = yield from self._block(step.choose())
+            if act is not None:
+                left = act()
+            elif choose is not None:
+                left = yield from self._block(choose())
             else:
-                left = yield from self._statement(step.statement)
+                left = yield from self._statement(statement)
             if left:
                 return left
         return ""
 
     def _steps(self, statements: tuple[tree.Statement, ...]) -> list[_Step]:
         """The statements of a block, prepared at its first run."""
-        steps = self._prepared.get(id(statements))
-        if steps is None:
+        try:
+            return self._prepared[id(statements)]
+        except KeyError:
             self._prepared[id(statements)] = steps = [self._step_of(statement) for statement in statements]
-        return steps
+            return steps
 
     def _step_of(self, statement: tree.Statement) -> _Step:
         plain = self._is_plain(statement)

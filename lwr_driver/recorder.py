@@ -29,7 +29,7 @@ from lwr_driver.session.writer import ExitStatus
 _PAUSE_S = 0.02
 _BUSY_ROWS = 1000
 # Rows are encoded in batches: so many at least, or this share of the ring, or those of this time.
-_BATCH_ROWS, _BATCH_SHARE, _BATCH_S = 1000, 8, 0.1
+_BATCH_ROWS, _BATCH_SHARE, _BATCH_S = 2000, 4, 0.2
 _START_TIMEOUT_S = 60.0
 _REPLY_TIMEOUT_S = 60.0
 _NICE = 5

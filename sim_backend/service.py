@@ -10,11 +10,8 @@ import socket
 import time
 from collections.abc import Callable
 
-import numpy as np
-
 from fri.controller_end import ControllerEnd
 from fri.in_process import Network, Port
-from fri.packets import CMD
 from fri.states import State
 from lwr_driver.hosted_loop import Seat
 from sim_backend.ahead import CabinetAhead, prepare
@@ -37,7 +34,6 @@ _PERHAPS_S = 0.02
 _PACED_AFTER = 2000
 _PENDANT_EVERY = 50
 _MANY = 250  # most cycles at once: the pendant and requests of the driver wait for so long
-_NO_COMMANDS = np.zeros(0, CMD)
 
 
 class Service:
@@ -193,10 +189,14 @@ class Service:
         cabinet, operator, end = self.cabinet, self.operator, self.end
         if not cabinet.ordinary or not self._undisturbed():
             return False
+        commands = seat.offer(_MANY)
+        if not len(commands):
+            return False
+        # Nothing has happened yet, and what the pendant does now comes first.
         self._look(0.0)
-        age_s = self.config.fri.answer_delay_s
-        commands = seat.offer(_MANY) if self._undisturbed() and self.running else _NO_COMMANDS
-        ahead = CabinetAhead.of(cabinet, commands, age_s) if len(commands) else None
+        if not (self.running and self._undisturbed()):
+            return False
+        ahead = CabinetAhead.of(cabinet, commands, self.config.fri.answer_delay_s)
         if ahead is None:
             return False
         commands = commands[: len(ahead.packets)]
