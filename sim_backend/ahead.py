@@ -41,11 +41,13 @@ def _millisecond(work, modes, now, arm, controller, table, settings, gravity, ma
     reading, middle, cycle = work[11:15], work[16:18], settings[4]
     position = work[2] if settings[6] > 0.0 else work[0]
     read(position, work[0], work[4], table[7:15], now[0:3], reading)
-    bias[:] = 0.0
+    for i in range(bias.shape[0]):
+        bias[i] = 0.0
     bodies.torques(controller, now[3], bias, gravity)
     feedback(now[3], gravity, reading[1], reading[2], table[0:7], work[7:11], settings[0:4], work[15])
     read_motor(work[5], work[15], table[7:15], now[0:3], reading)
-    work[5, :] = work[15]
+    for i in range(bias.shape[0]):
+        work[5, i] = work[15, i]
     predict(work[2], work[3], work[6], 0.5 * cycle, middle)
     bodies.mass_matrix(arm, middle[0], mass)
     bodies.torques(arm, middle[0], middle[1], bias)
@@ -62,8 +64,11 @@ def _run(work, modes, drive, arm, controller, table, settings, gravities, past, 
     mass, bias = np.empty((n, n)), np.empty(n)
     for k in range(drive.shape[0]):
         _millisecond(work, modes, drive[k], arm, controller, table, settings, gravities[k], mass, bias)
-        past[k] = work
-        past_modes[k] = modes
+        for row in range(work.shape[0]):
+            for i in range(n):
+                past[k, row, i] = work[row, i]
+        for i in range(n):
+            past_modes[k, 0, i], past_modes[k, 1, i] = modes[0, i], modes[1, i]
 
 
 class ArmAhead:

@@ -186,25 +186,22 @@ def mass_matrix(chain, q, out):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def pose(chain, q, out):  # type: ignore[no-untyped-def]
     """Pose of the tip in the base at q (n,) into `out` (12,), 3x4 row-major [R | p]."""
-    n = q.shape[0]
-    rotation, turn, place = np.empty(9), np.empty(9), np.zeros(3)
-    now = np.zeros(9)
-    now[0] = now[4] = now[8] = 1.0
-    for i in range(n + 1):
-        row = chain[i]
-        if i < n:
-            _turn(row, q[i], turn)
-        else:
-            turn[:] = row[:9]
-        at = 27 if i < n else 9
-        for k in range(3):
-            place[k] += now[3 * k] * row[at] + now[3 * k + 1] * row[at + 1] + now[3 * k + 2] * row[at + 2]
-            for m in range(3):
-                rotation[3 * k + m] = (
-                    now[3 * k] * turn[m] + now[3 * k + 1] * turn[3 + m] + now[3 * k + 2] * turn[6 + m]
-                )
-        now[:] = rotation
+    n, turn = q.shape[0], np.empty(9)
+    for k in range(12):
+        out[k] = 1.0 if k % 5 == 0 else 0.0
+    for i in range(n):
+        _turn(chain[i], q[i], turn)
+        _onwards(turn, chain[i], 27, out)
+    _onwards(chain[n], chain[n], 9, out)
+
+
+@njit(cache=True)
+def _onwards(turn, row, at, out):  # type: ignore[no-untyped-def]
+    """Append a frame to the pose `out` (12,): its rotation `turn` (9,), its place from column `at` of `row` on."""
+    p0, p1, p2 = row[at], row[at + 1], row[at + 2]
     for k in range(3):
-        for m in range(3):
-            out[4 * k + m] = now[3 * k + m]
-        out[4 * k + 3] = place[k]
+        r0, r1, r2 = out[4 * k], out[4 * k + 1], out[4 * k + 2]
+        out[4 * k + 3] += r0 * p0 + r1 * p1 + r2 * p2
+        out[4 * k] = r0 * turn[0] + r1 * turn[3] + r2 * turn[6]
+        out[4 * k + 1] = r0 * turn[1] + r1 * turn[4] + r2 * turn[7]
+        out[4 * k + 2] = r0 * turn[2] + r1 * turn[5] + r2 * turn[8]

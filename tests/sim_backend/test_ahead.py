@@ -207,8 +207,8 @@ def _abort(pair: Pair) -> None:
     pair.control.words[Word.STOP] += 1
 
 
-def _spoil(pair: Pair) -> None:
-    pair.control.plan[pair.loop._commander.index + 150, 3] += 0.01
+def _spoil(distance: float, pair: Pair) -> None:
+    pair.control.plan[pair.loop._commander.index + 150, 3] += distance
 
 
 def _offset(pair: Pair) -> None:
@@ -228,7 +228,9 @@ CASES = {
     "motor-side sensors": Case(settings={"sensors.position_sensor": "motor"}),
     "friction in the watch": Case(friction=2.0),
     "abort": Case(_abort, ends=Result.ABORTED),
-    "guard": Case(_spoil, ends=Result.GUARD),
+    "guard": Case(partial(_spoil, 0.01), ends=Result.GUARD),
+    # Too small for the controller to object.
+    "guard alone": Case(partial(_spoil, 2e-4), ends=Result.GUARD),
     "contact": Case(_offset, ends=Result.ROBOT),
     "push": Case(lambda pair: pair.operator.push([0.0, 40.0, 0.0, 0.0, 0.0, 0.0, 0.0]), ends=Result.ROBOT),
     "brakes": Case(lambda pair: pair.cabinet.plant.brake(True), ends=Result.ROBOT),
