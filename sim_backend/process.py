@@ -43,7 +43,7 @@ class Emulator:
     verbosity : None keeps messages for `messages`; otherwise they go to the terminal: 0 what must be seen, 1 events of
     the session, 2 finer changes
     hosting : in lock step, take the loop of this process's driver in, `Driver(..., host=emulator.host)`; no UDP then
-    start_s : time limit for the start of the emulator [s]
+    start_s : time limit for the start of the emulator [s]; the first on a computer compiles for half a minute or more
 
     The child ends with `stop`, with the `with` block, and with this process: it watches a pipe from its parent.
     Raises ConfigurationError for a wrong argument.
@@ -63,7 +63,7 @@ class Emulator:
         once: bool = False,
         verbosity: int | None = None,
         hosting: bool = False,
-        start_s: float = 60.0,
+        start_s: float = 300.0,
     ) -> None:
         self.config = find(config)
         self.lock_step = lock_step
