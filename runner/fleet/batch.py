@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -121,9 +122,21 @@ def _next_part(store: FleetStore, day: ArmDay) -> ArmDay:
     return day
 
 
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the warnings of each estimate; a task may run in the process of its caller."""
+    logger = logging.getLogger("ident")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+@_quiet()
 def _identified(folder: Path, day: ArmDay, order: Order) -> list[Progress]:
     """Identify one day and write it; an error is a result too."""
-    logging.getLogger("ident").setLevel(logging.ERROR)
     store = ArmStore(folder / day.arm)
     sessions, rows = _read(day)
     error = ""
@@ -204,9 +217,9 @@ def _write_day(store: ArmStore, day: ArmDay, found: Identification) -> None:
         write_model(found.model, store.model)
 
 
+@_quiet()
 def _diagnosed_arm(folder: Path, arm: str, order: Order, usual: Mapping[str, float]) -> list[Progress]:
     """The diagnoses that an arm's days ask for."""
-    logging.getLogger("ident").setLevel(logging.ERROR)
     store = ArmStore(folder / arm)
     try:
         return _diagnoses(store, order, usual)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import datetime
 import json
+import logging
 import shutil
 from pathlib import Path
 
@@ -11,12 +13,14 @@ import pytest
 from click.testing import CliRunner
 from playwright.sync_api import Browser
 
+from ident.estimation.identify import IdentificationSettings
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import read_model
 from lwr_driver.session import SessionWriter, session_metadata
 from runner.cli import main
 from runner.fleet import FleetStore, fleet_trend
-from runner.fleet.days import find_days
+from runner.fleet.batch import Order, _identified
+from runner.fleet.days import ArmDay, find_days
 from tests.fleet import Event, Fleet
 from tests.ident.known_arm import truth_model  # noqa: F401  fixture
 from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, flaws, opened
@@ -93,6 +97,19 @@ def test_recordings_with_one_uid_are_no_copies(tmp_path: Path) -> None:
     found = find_days([tmp_path])
     assert [day.day.isoformat() for day in found.days] == ["2026-03-01", "2026-03-02"]
     assert [path.parent.name for path in found.repeated] == ["copy"]
+
+
+def test_a_task_leaves_the_loggers_of_its_process_as_they_were(tmp_path: Path) -> None:
+    logger = logging.getLogger("ident")
+    before = logger.level
+    logger.setLevel(logging.INFO)
+    day = ArmDay("arm", datetime.date(2026, 3, 1), (), 1)
+    try:
+        (told,) = _identified(tmp_path, day, Order(IdentificationSettings()))
+        assert told.error == "no usable log"
+        assert logger.level == logging.INFO
+    finally:
+        logger.setLevel(before)
 
 
 def test_the_model_of_all_days_comes_from_the_factors_alone(fleet: Fleet, store: FleetStore) -> None:
