@@ -114,26 +114,17 @@ def _ended(task: Task, broken: Sequence[BrokenChannel]) -> Diagnosis:
 
 
 def _first(task: Task) -> State:
-    """The first selection, with the noise from the best candidate's residual if repetition does not give it.
-
-    Without repetition a strong cause counts as noise of its rows until it is in the model, whatever other rows show.
-    """
+    """The first selection, with the noise from the best candidate's residual if repetition does not give it."""
     bench = task.bench(task.arm, task.reference, fit_compliance=task.reference is None)
     selection = task.select(bench)
-    plain = State(bench, selection)
-    best = None if bench.repeatable else best_candidate(bench.dictionary, bench.evidence, task.settings)
+    if bench.repeatable or selection.claims:
+        return State(bench, selection)
+    best = best_candidate(bench.dictionary, bench.evidence, task.settings)
     quieter = None if best is None else again_with(bench, best, task.settings, task.causes)
-    if best is None or quieter is None:
-        return plain
-    wanted = {claim.trial.candidate.key for claim in best.claims}
-    if wanted <= _keys(selection):
-        return plain
+    if quieter is None:
+        return State(bench, selection)
     again = task.select(quieter)
-    return State(quieter, again) if wanted <= _keys(again) or not selection.claims else plain
-
-
-def _keys(selection: Selection) -> set[tuple[str, int]]:
-    return {claim.trial.candidate.key for claim in selection.claims}
+    return State(quieter, again) if again.claims else State(bench, selection)
 
 
 def _in_time(task: Task, state: State) -> State:
