@@ -13,7 +13,15 @@ from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, doubted
 from ident.diagnosis.evidence import Floats
-from ident.diagnosis.extension import Member, extension, nameless_terms, power_left, title, torque_error
+from ident.diagnosis.extension import (
+    Member,
+    extension,
+    held_out_with,
+    nameless_terms,
+    power_left,
+    title,
+    torque_error,
+)
 from ident.diagnosis.findings import loss_finding
 from ident.diagnosis.held_out import HeldOut, held_out
 from ident.diagnosis.nominal import GAIN_STD, TRAVEL_RAD, Nominal
@@ -190,9 +198,9 @@ def _predicting(
 
     The rows end at the parallel filter's band; the torque error has all samples, as users compute the torque.
     """
-    evidence, nuisance = state.bench.evidence, state.selection.nuisance_rows
     if not task.test or not members:
         return members, after, []
+    bench, nuisance = state.bench, state.selection.nuisance_rows
     refuted: list[Finding] = []
     base, extended, _ = _models(task, state, baseline, members, after)
     limit, left = (torque_error(model, task.test) for model in (base, extended))
@@ -200,13 +208,13 @@ def _predicting(
         found = []
         for member in members:
             rest = [m for m in members if m is not member]
-            held = held_out(evidence, [*(rows for m in rest for rows in m.rows), *nuisance])
+            held = held_out_with(bench, rest, nuisance)
             model = _models(task, state, baseline, rest, held)[1]
             found.append((torque_error(model, task.test), member))
         left, worst = min(found, key=lambda pair: pair[0])
         members = [m for m in members if m is not worst]
         refuted += [worst.finding] if worst.finding is not None else []
-    after = held_out(evidence, [*(rows for m in members for rows in m.rows), *nuisance])
+        after = held_out_with(bench, members, nuisance)
     return members, after, refuted
 
 

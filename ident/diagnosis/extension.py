@@ -42,7 +42,7 @@ def extension(
     """
 
     def with_members(chosen: Sequence[Member]) -> HeldOut:
-        return held_out(bench.evidence, [*(rows for m in chosen for rows in m.rows), *nuisance])
+        return held_out_with(bench, chosen, nuisance)
 
     while True:
         after = with_members(members)
@@ -62,6 +62,11 @@ def extension(
         if errors[best] > power_left(baseline.held, after):
             return members, with_members(members)
         members = left[best]
+
+
+def held_out_with(bench: DiagnosisBench, members: Sequence[Member], nuisance: Sequence[Rows]) -> HeldOut:
+    """The held-out rows with the members; the columns of the evidence are theirs afterwards."""
+    return held_out(bench.evidence, [*(rows for m in members for rows in m.rows), *nuisance])
 
 
 def power_left(before: HeldOut, after: HeldOut) -> float:
