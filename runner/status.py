@@ -218,8 +218,9 @@ class StatusLine:
                 self.say(task)
         if self._watched:
             heading = f"{task}: {phase}" if phase else task
+            new = heading != self._line.heading
             self._line.heading, self._line.fraction, self._line.details = heading, fraction, details
-            self._draw()
+            self._draw(new)
 
     def wait(self, awaited: str, since_s: float, seen: str, advice: str) -> None:
         """Say once what is awaited, with the advice, and count the seconds. advice : none is needed if empty."""
@@ -248,7 +249,8 @@ class StatusLine:
             _shown.remove(self)
         self._task = ""
 
-    def _draw(self) -> None:
+    def _draw(self, at_once: bool = False) -> None:
+        """Draw the line with the next refresh, or at once, as a phase that ends before it."""
         if self._live is None:
             from rich.live import Live
 
@@ -262,4 +264,4 @@ class StatusLine:
             )
             self._live.start()
             _shown.append(self)
-        self._live.update(self._line)
+        self._live.update(self._line, refresh=at_once)

@@ -46,7 +46,7 @@ class Screen(pyte.Screen):
 
 @dataclass
 class Seen:
-    """The screens of a command. frames : the text after each chunk of output."""
+    """The screens of a command. frames : the text after each piece of output."""
 
     screen: Screen
     frames: list[list[str]] = field(default_factory=list)
@@ -79,8 +79,10 @@ def watch(columns: int, command: list[str], place: Path, **environment: str) -> 
             break
         if not data:
             break
-        stream.feed(decode(data))
-        seen.frames.append(seen.text)
+        # A slow reader finds several screens in one piece; each begins by returning the cursor.
+        for text in re.split(r"(?=\r\x1b)", decode(data)):
+            stream.feed(text)
+            seen.frames.append(seen.text)
     os.close(leader)
     seen.code = process.wait()
     return seen
@@ -103,7 +105,6 @@ def test_no_line_of_an_experiment_is_broken_by_the_margin(seen: Seen) -> None:
 @pytest.mark.slow
 def test_one_live_line_has_phase_bar_and_time(seen: Seen) -> None:
     live = [line for line in seen.lines() if "━" in line or "─" in line]
-    # A motion takes less time than some of the screens.
     assert any(re.match(r"(un)?loaded: period 1 ", line) for line in live), live
     assert all(sum("━" in line for line in frame) <= 1 for frame in seen.frames)
     assert any("estimating the model" in line for line in seen.lines())
