@@ -19,9 +19,6 @@ import argparse
 import dataclasses
 import os
 
-from benchmarks.real_arms import defaults
-from benchmarks.real_cases import iiwa14, tx40, unseen
-
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import sys
@@ -34,6 +31,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.real_arms import defaults
+from benchmarks.real_cases import iiwa14, tx40, unseen
 from ident.dynamics.kinematics import Chain
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.mounting import Mounting, find_mounting

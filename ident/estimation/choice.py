@@ -1,14 +1,15 @@
 """Choice of the estimator by what it predicts: the torque of parts of the training motion held back.
 
 Candidates are weighted least squares, and physically consistent bodies with the inertials of the URDF as prior: as
-stated, and with looser standard deviations. Each is scored with the base upright and leaning, and the best of them
-with a gain for the joint torque sensors.
+stated, and with looser standard deviations. Each is scored with the base upright and leaning, without and with gains
+for the joint torque sensors.
 
 **Choice.** The squared error over the squared torque counts, over all joints and parts (`ident.estimation.parts`);
-motor and joint side count alike. Deviations of the prior are loosened as long as the error falls by a percent. Every
-further freedom has to pay by more than one standard error of the difference (Breiman et al. 1984): a leaning base,
-least squares in place of the prior. A tilt beyond chance (p < 0.001 for an upright base) has to pay at all. Gains of
-sensors pay by two standard errors; only those beyond two standard deviations are free.
+motor and joint side count alike. Every freedom has to pay by a percent and by two standard errors of the difference:
+ten times the variance of the prior, gains of sensors that are beyond two standard deviations, a leaning base, least
+squares in place of the prior. Of those that pay the one with the largest fall is taken first, and a looser prior that
+does not pay beside it is taken back: bodies free of the prior mimic a sensor's gain on the motion of the training,
+and on no other. A tilt beyond chance (p < 0.001 for an upright base) has to pay at all.
 An arm with gains is identified from the torques divided by them, and its model states them as effects.
 
 Normal equations of each part are made once, so a linear candidate costs a solution a part, a physical one a conic
@@ -52,11 +53,12 @@ from ident.rows.sessions import require
 from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
 
-_SCALES = (1.0, 10.0, 100.0)
+# Largest factor on the variance of the prior, and steps to it.
+_LOOSEST, _LOOSER = 100.0, 10.0
 _TILT_STD_RAD = float(np.deg2rad(2.0))
 _GAIN_STD = 0.05
-# Standard errors and deviations that a sensor's gain has to exceed: a claim about the robot, beyond a better fit.
-_GAIN_SURE = 2.0
+# Standard errors by which a freedom has to pay, and standard deviations that a sensor's gain has to exceed.
+_SURE = 2.0
 # Largest probability of an upright base behind so large a tilt, for a tilt beyond chance.
 _UPRIGHT = 1e-3
 # Errors this close to one another count as equal, and so much of a joint's torque as nothing.
@@ -333,25 +335,15 @@ class _Comparison:
             text = f"not compared: the motion is too short for parts of {self.block_s:.1f} s to be held back"
             return Choice((unknown,), 0, 0, self.block_s, excluded, self._disagreement(), (text, *advice))
         found: dict[Kind, Floats] = {}
+        best = []
         for tilt in tilted if bodies else ():
-            for scale in _SCALES:
-                try:
-                    found["physical", scale, tilt, ()] = self._errors(("physical", scale, tilt, ()))
-                except DataError as error:
-                    excluded = (*excluded, f"physical: {error}")
-                    break
-                before = found.get(("physical", 0.1 * scale, tilt, ()))
-                if before is not None and not self._pays(before, found["physical", scale, tilt, ()], 0.0):
-                    break
+            try:
+                best.append(self._freed(("physical", 1.0, tilt, ()), found))
+            except DataError as error:
+                excluded = (*excluded, f"physical: {error}")
         if self.full_rank:
-            found |= {kind: self._errors(kind) for tilt in tilted for kind in [("wls", None, tilt, ())]}
-        chosen = self._preferred(found)
-        gains = self._gains_of(chosen)
-        if gains:
-            wide: Kind = (*chosen[:3], gains)
-            found[wide] = self._errors(wide)
-            if self._pays(found[chosen], found[wide], _GAIN_SURE):
-                chosen = wide
+            best += [self._freed(("wls", None, tilt, ()), found) for tilt in tilted]
+        chosen = self._preferred(best, found)
         kinds = sorted(found, key=lambda kind: (math.inf if kind[1] is None else kind[1], kind[2:]))
         squares = np.array([found[kind] for kind in kinds])
         share = np.array([self._share(square) for square in squares])
@@ -379,21 +371,38 @@ class _Comparison:
             gains={self.joints[g]: (float(value), float(std)) for g, value, std in stated},
         )  # fmt: skip
 
-    def _preferred(self, found: Mapping[Kind, Floats]) -> Kind:
-        """The candidate whose freedoms all pay: prior before least squares, upright before leaning base."""
-        chosen: Kind | None = None
-        for family in dict.fromkeys((kind[0], kind[2]) for kind in found):
-            best: Kind | None = None
-            for kind in found:
-                if (kind[0], kind[2]) == family and (
-                    best is None or self._pays(found[best], found[kind], 0.0)
-                ):
-                    best = kind
-            assert best is not None
-            real = chosen is not None and best[2] > chosen[2] and self._leans(best)
-            if chosen is None or self._pays(found[chosen], found[best], 0.0 if real else 1.0):
-                chosen = best
-        assert chosen is not None
+    def _freed(self, kind: Kind, found: dict[Kind, Floats]) -> Kind:
+        """The candidate with the freedoms that pay, the one with the largest fall first. found : errors of all tried,
+        which it adds to."""
+
+        def pays(before: Kind, after: Kind) -> bool:
+            for one in (before, after):
+                if one not in found:
+                    found[one] = self._errors(one)
+            return self._pays(found[before], found[after], _SURE)
+
+        found[kind] = self._errors(kind)
+        while paying := [wider for wider in self._wider(kind) if pays(kind, wider)]:
+            kind = min(paying, key=lambda one: self._share(found[one]).sum())
+            while (tighter := _tighter(kind)) and not pays(tighter, kind):
+                kind = tighter
+        return kind
+
+    def _wider(self, kind: Kind) -> Iterator[Kind]:
+        """The candidates with one freedom more: a looser prior, gains of the sensors."""
+        estimator, scale, tilt, gains = kind
+        if scale is not None and scale < _LOOSEST:
+            yield estimator, _LOOSER * scale, tilt, gains
+        if not gains and (beyond_chance := self._gains_of(kind)):
+            yield estimator, scale, tilt, beyond_chance
+
+    def _preferred(self, best: Sequence[Kind], found: Mapping[Kind, Floats]) -> Kind:
+        """The first of the candidates, or a later one that pays: prior before least squares, upright before leaning."""
+        chosen, *others = best
+        for kind in others:
+            real = kind[2] > chosen[2] and self._leans(kind)
+            if self._pays(found[chosen], found[kind], 0.0 if real else _SURE):
+                chosen = kind
         return chosen
 
     def _pays(self, before: Floats, after: Floats, sure: float) -> bool:
@@ -467,7 +476,7 @@ class _Comparison:
         if len(self.joints) < 2:
             return ()
         value, std = self._gains((*kind[:3], tuple(range(len(self.joints)))))
-        return tuple(np.flatnonzero(np.abs(value) > _GAIN_SURE * std).tolist())
+        return tuple(np.flatnonzero(np.abs(value) > _SURE * std).tolist())
 
     def _scores(
         self, used: NDArray[np.int64], weights: Floats, prior: Prior, physical: float | None = None
@@ -545,7 +554,7 @@ class _Comparison:
             worse = [
                 c.label
                 for c, e, s in zip(self.problem.classes, excess, std, strict=True)
-                if e > 2.0 * s
+                if e > _SURE * s
                 and mine.by_joint_percent[c.label] > other.by_joint_percent[c.label] + 100.0 * _ALIKE
             ]
             if worse:
@@ -554,6 +563,12 @@ class _Comparison:
                     for label in worse
                 )
                 yield f"least squares predicts single joints better than the chosen estimator: {listed}"
+
+
+def _tighter(kind: Kind) -> Kind | None:
+    """The same with the next smaller variance of the prior, None for the stated one."""
+    estimator, scale, tilt, gains = kind
+    return None if scale is None or scale <= 1.0 else (estimator, scale / _LOOSER, tilt, gains)
 
 
 def _paired(difference: Floats) -> tuple[Floats, Floats]:

@@ -108,6 +108,8 @@ def test_a_sensor_that_reads_too_much_is_found_and_stated_as_an_effect():
     assert found.choice is not None
     (joint,) = found.choice.gains
     assert joint == chain().joint_names[1]
+    # Bodies free of the prior mimic a part of the gain; beside it they do not pay.
+    assert found.choice.winner.title == f"physical, sensor gain of {joint}"
     error, std = found.choice.gains[joint]
     assert error == pytest.approx(0.08, abs=3.0 * std)
     assert std < 0.02
