@@ -335,14 +335,18 @@ class _Comparison:
             text = f"not compared: the motion is too short for parts of {self.block_s:.1f} s to be held back"
             return Choice((unknown,), 0, 0, self.block_s, excluded, self._disagreement(), (text, *advice))
         found: dict[Kind, Floats] = {}
-        best = []
+        best = list[Kind]()
         for tilt in tilted if bodies else ():
+            stated: Kind = ("physical", 1.0, tilt, ())
             try:
-                best.append(self._freed(("physical", 1.0, tilt, ()), found))
+                best.append(self._freed(stated, found))
             except DataError as error:
                 excluded = (*excluded, f"physical: {error}")
+                best += [stated] if stated in found else []
         if self.full_rank:
             best += [self._freed(("wls", None, tilt, ()), found) for tilt in tilted]
+        if not best:
+            raise DataError(f"no estimator can be compared on these data: {'; '.join(excluded)}")
         chosen = self._preferred(best, found)
         kinds = sorted(found, key=lambda kind: (math.inf if kind[1] is None else kind[1], kind[2:]))
         squares = np.array([found[kind] for kind in kinds])
@@ -365,10 +369,10 @@ class _Comparison:
         )
         place = kinds.index(chosen)
         advice += self._worse_joints(candidates, squares, place)
-        stated = zip(chosen[3], *self._gains(chosen), strict=True) if chosen[3] else ()
+        readings = zip(chosen[3], *self._gains(chosen), strict=True) if chosen[3] else ()
         return Choice(
             candidates, place, len(self.held), self.block_s, excluded, self._disagreement(), tuple(advice),
-            gains={self.joints[g]: (float(value), float(std)) for g, value, std in stated},
+            gains={self.joints[g]: (float(value), float(std)) for g, value, std in readings},
         )  # fmt: skip
 
     def _freed(self, kind: Kind, found: dict[Kind, Floats]) -> Kind:
