@@ -260,7 +260,11 @@ def commission(
         log.info("healthy set %d of %d", number + 1, len(parts))
     found = _reference(days, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
     provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals)}
-    return replace(found, model=replace(found.model, provenance=provenance))
+    return replace(
+        found,
+        model=replace(found.model, provenance=provenance),
+        compliance_std=compliance_std([one.compliance for one in several]),
+    )
 
 
 def character(
@@ -449,6 +453,13 @@ def _known(day: _Day, usual: _Day) -> tuple[Floats, Floats]:
     values[pairs[:, 1]] = day.values[pairs[:, 0]]
     covariance[np.ix_(pairs[:, 1], pairs[:, 1])] = day.covariance[np.ix_(pairs[:, 0], pairs[:, 0])]
     return values, covariance
+
+
+def compliance_std(sets: Sequence[Floats]) -> Floats | None:
+    """Standard error (n,) [rad/Nm] of the mean of the compliances (n,) of healthy sets, None for a single set."""
+    if len(sets) < 2:
+        return None
+    return np.asarray(np.std(sets, axis=0, ddof=1) / np.sqrt(len(sets)))
 
 
 def delay_std(late: Sequence[tuple[float, float]]) -> float:

@@ -48,6 +48,8 @@ _USUAL_CHANGES = 2.0
 _ALIKE = 4.0
 # Relative standard deviation of an announced mass.
 _WEIGHED = 0.02
+# Relative error within which a stiffness counts as known.
+_STIFFNESS_WITHIN = 0.2
 _ONE_IN = 0.01
 _AS_SETS = 4
 
@@ -62,7 +64,8 @@ class Reference:
     presliding : (n,) presliding length [rad], None if unknown. far, far_share : (n,) see `nominal.Arm`.
     delay_std_s : of the channels' delays from day to day, by side. habits : whether the covariance of the model holds
     the changes from day to day. masses : announced, of its payloads [kg].
-    gain_std : of the torque sensors' gains from day to day.
+    gain_std : of the torque sensors' gains from day to day. compliance_std : (n,) [rad/Nm] standard error of the
+    compliance from its scatter over the sets, None for a single one.
     """
 
     model: DynamicModel
@@ -80,6 +83,16 @@ class Reference:
     habits: bool = False
     masses: Mapping[str, float | None] = field(default_factory=dict)
     gain_std: float = GAIN_STD
+    compliance_std: Floats | None = None
+
+    @property
+    def unknown_stiffness(self) -> tuple[str, ...]:
+        """Joints with a stiffness that the sets do not tell within 20 % (95 %); none without a scatter of sets."""
+        if self.compliance_std is None:
+            return ()
+        unsure = 2.0 * self.compliance_std > _STIFFNESS_WITHIN * self.compliance
+        names = self.model.structure.chain.joint_names
+        return tuple(name for name, found in zip(names, unsure, strict=True) if found)
 
     def __repr__(self) -> str:
         joints = self.model.structure.chain.joint_names
@@ -92,7 +105,12 @@ class Reference:
                 f"Reference of {self.model.robot}: {len(self.model.names)} parameters, healthy sets: {self.sets}",
                 f"  positions of the {self.encoder} side; delays: motor {1e3 * self.motor_delay_s:.2f} ms, "
                 f"joint {1e3 * self.joint_delay_s:.2f} ms",
-                f"  stiffness [Nm/rad]: {stiff or 'unknown'}",
+                f"  stiffness [Nm/rad]: {stiff or 'unknown'}"
+                + (
+                    f"; not known within 20 %: {', '.join(unsure)}"
+                    if (unsure := self.unknown_stiffness)
+                    else ""
+                ),
             ]
         )
 
@@ -114,9 +132,9 @@ class Reference:
             delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
             delay_std = {side: float(v) for side, v in stored.get("delay_std_s", {}).items()}
             sets, encoder = int(stored["sets"]), str(stored["encoder"])
-            presliding, far, far_share = (
+            presliding, far, far_share, compliance_std = (
                 np.array(stored[name], dtype=np.float64) if stored.get(name) else None
-                for name in ("reach", "far", "far_share")
+                for name in ("reach", "far", "far_share", "compliance_std")
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ConfigurationError(
@@ -143,6 +161,7 @@ class Reference:
             habits,
             masses,
             float(stored.get("gain_std", GAIN_STD)),
+            compliance_std,
         )
 
     def stored(self) -> dict[str, Any]:
@@ -150,6 +169,7 @@ class Reference:
         return {
             _KEY: {
                 "compliance": [float(v) for v in self.compliance],
+                "compliance_std": _listed(self.compliance_std),
                 "motor_delay_s": self.motor_delay_s,
                 "joint_delay_s": self.joint_delay_s,
                 "delay_std_s": dict(self.delay_std_s),

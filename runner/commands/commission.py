@@ -204,6 +204,9 @@ def _ending(found: Reference, sets: int, sessions: int, names: tuple[str, ...], 
     rows: list[tuple[str, ...]] = []
     if len(found.compliance) and (found.compliance > 0.0).all():
         rows.append(("stiffness [Nm/rad]", *(f"{1.0 / c:.0f}" for c in found.compliance)))
+        if found.compliance_std is not None:
+            shares = 100.0 * found.compliance_std / found.compliance
+            rows.append(("  ± by its scatter [%]", *(f"{share:.0f}" for share in shares)))
     rows += [(f"noise, {side} [Nm]", *(f"{v:.4f}" for v in values)) for side, values in found.noise.items()]
     delays = [
         (f"{side} torque", f"{1e3 * delay:.2f} ± {1e3 * found.delay_std_s[side]:.2f} ms from day to day")
@@ -225,7 +228,13 @@ def _ending(found: Reference, sets: int, sessions: int, names: tuple[str, ...], 
         "",
         "look",
     )
-    look = [few] if sets < _RECORDED_SETS else []
+    unsure = Verdict(
+        "stiffness unknown",
+        f"the sets do not tell it within 20 % in {', '.join(found.unknown_stiffness)}; more sets, or faster motions",
+        "",
+        "look",
+    )
+    look = [few] * (sets < _RECORDED_SETS) + [unsure] * bool(found.unknown_stiffness)
     return Ending(
         "look" if look else "good",
         f"The healthy arm, from {sessions} sessions in {sets} set{'s' if sets > 1 else ''}.",

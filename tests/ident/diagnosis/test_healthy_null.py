@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.diagnosis.commission import delay_std, gain_std, with_far_presliding
+from ident.diagnosis.commission import compliance_std, delay_std, gain_std, with_far_presliding
 from ident.diagnosis.nominal import GAIN_STD, NominalArm
 from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.dynamics.base_set import numeric_base
@@ -125,6 +125,24 @@ def test_scatter_of_the_sensors_gains_is_learned_from_all_joints() -> None:
     # One day, or values less certain than the usual change, say nothing of other days.
     assert gain_std(days(0.02)[:1]) == GAIN_STD
     assert gain_std([np.stack([np.full(7, 0.1 * k), np.full(7, 0.05)]) for k in range(3)]) == GAIN_STD
+
+
+def test_a_stiffness_that_differs_from_set_to_set_is_unknown(model: DynamicModel) -> None:
+    sets = [np.array([1e-4, 1e-4, 0.0]), np.array([1.05e-4, 1.8e-4, 0.0])]
+    std = compliance_std(sets)
+    assert std is not None
+    np.testing.assert_allclose(std, [0.025e-4, 0.4e-4, 0.0])
+    healthy = replace(reference(model, {}, 2), compliance=np.mean(sets, axis=0), compliance_std=std)
+    names = model.structure.chain.joint_names
+    assert healthy.unknown_stiffness == (names[1],)
+    assert f"not known within 20 %: {names[1]}" in repr(healthy)
+    stored = replace(model, provenance=healthy.stored())
+    assert Reference.of(stored).unknown_stiffness == (names[1],)
+
+
+def test_one_set_says_nothing_of_its_stiffness(model: DynamicModel) -> None:
+    assert compliance_std([np.full(3, 1e-4)]) is None
+    assert Reference.of(replace(model, provenance=reference(model, {}, 1).stored())).unknown_stiffness == ()
 
 
 def test_another_payload_shares_no_parameter_and_has_its_announced_mass(chain: Chain) -> None:
