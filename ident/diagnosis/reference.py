@@ -65,7 +65,8 @@ class Reference:
     delay_std_s : of the channels' delays from day to day, by side. habits : whether the covariance of the model holds
     the changes from day to day. masses : announced, of its payloads [kg].
     gain_std : of the torque sensors' gains from day to day. compliance_std : (n,) [rad/Nm] standard error of the
-    compliance from its scatter over the sets, None for a single one.
+    compliance from its scatter over the sets, None for a single one; 0 where no set differs from the first beyond
+    chance.
     """
 
     model: DynamicModel

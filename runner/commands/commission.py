@@ -206,7 +206,8 @@ def _ending(found: Reference, sets: int, sessions: int, names: tuple[str, ...], 
         rows.append(("stiffness [Nm/rad]", *(f"{1.0 / c:.0f}" for c in found.compliance)))
         if found.compliance_std is not None:
             shares = 100.0 * found.compliance_std / found.compliance
-            rows.append(("  ± by its scatter [%]", *(f"{share:.0f}" for share in shares)))
+            differ = (f"{share:.0f}" if share > 0.0 else "–" for share in shares)
+            rows.append(("  ± where sets differ [%]", *differ))
     rows += [(f"noise, {side} [Nm]", *(f"{v:.4f}" for v in values)) for side, values in found.noise.items()]
     delays = [
         (f"{side} torque", f"{1e3 * delay:.2f} ± {1e3 * found.delay_std_s[side]:.2f} ms from day to day")
