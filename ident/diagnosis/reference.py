@@ -101,17 +101,13 @@ class Reference:
             f"{name} {1.0 / c:.4g}" if c > 0.0 else f"{name} rigid"
             for name, c in zip(joints, self.compliance, strict=False)
         )
+        unsure = ", ".join(self.unknown_stiffness)
         return "\n".join(
             [
                 f"Reference of {self.model.robot}: {len(self.model.names)} parameters, healthy sets: {self.sets}",
                 f"  positions of the {self.encoder} side; delays: motor {1e3 * self.motor_delay_s:.2f} ms, "
                 f"joint {1e3 * self.joint_delay_s:.2f} ms",
-                f"  stiffness [Nm/rad]: {stiff or 'unknown'}"
-                + (
-                    f"; not known within 20 %: {', '.join(unsure)}"
-                    if (unsure := self.unknown_stiffness)
-                    else ""
-                ),
+                f"  stiffness [Nm/rad]: {stiff or 'unknown'}{f'; not known within 20 %: {unsure}' if unsure else ''}",
             ]
         )
 

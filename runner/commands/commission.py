@@ -222,20 +222,16 @@ def _ending(found: Reference, sets: int, sessions: int, names: tuple[str, ...], 
         "",
         f"largest gains of causes by chance, mean of the sets (fall of chi-square): {listed}",
     ]
-    few = Verdict(
-        "few sets",
-        f"{sets} set{'s say' if sets > 1 else ' says'} little about changes from day to day; with "
-        f"{_RECORDED_SETS} or more a diagnosis claims more and errs less",
-        "",
-        "look",
-    )
-    unsure = Verdict(
-        "stiffness unknown",
-        f"the sets do not tell it within 20 % in {', '.join(found.unknown_stiffness)}; more sets, or faster motions",
-        "",
-        "look",
-    )
-    look = [few] * (sets < _RECORDED_SETS) + [unsure] * bool(found.unknown_stiffness)
+    look: list[Verdict] = []
+    if sets < _RECORDED_SETS:
+        text = (
+            f"{sets} set{'s say' if sets > 1 else ' says'} little about changes from day to day; with "
+            f"{_RECORDED_SETS} or more a diagnosis claims more and errs less"
+        )
+        look.append(Verdict("few sets", text, "", "look"))
+    if unknown := ", ".join(found.unknown_stiffness):
+        text = f"the sets do not tell it within 20 % in {unknown}; more sets, or faster motions"
+        look.append(Verdict("stiffness unknown", text, "", "look"))
     return Ending(
         "look" if look else "good",
         f"The healthy arm, from {sessions} sessions in {sets} set{'s' if sets > 1 else ''}.",
