@@ -194,7 +194,7 @@ def test_ctrl_c_stops_a_jog_within_limits(day: Day, tmp_path: Path) -> None:
     stop = steps._progress
     steps._progress = lambda now: driver.request_stop() if now.row > 60 else stop(now)  # type: ignore[method-assign]
     with pytest.raises(OperatorError, match="stop requested at row"):
-        steps.jog(tmp_path / "jog.mcap", "A2", -25.0, 0.05)
+        steps.jog(tmp_path / "jog.mcap", "A2", -25.0, 0.005)
     assert day.pendant.status()["monitor"]["violations"] == 0
     end = read_session(tmp_path / "jog.mcap").end
     assert end is not None
