@@ -194,16 +194,22 @@ def jackknife(
             weighted = left[rows] * row_weights[number][rows, None]
             normals[key] = normals.get(key, np.zeros((p, p))) + weighted.T @ group.matrix[rows]
             sums[key] = sums.get(key, np.zeros(p)) + left[rows].T @ coefficients[number][rows]
-    shifts = []
+    shifts, without = [], np.zeros(p)
     for key, normal in normals.items():
         rest = information - normal
         # Weak instruments can make a diagonal entry negative.
         scale = np.sqrt(np.maximum(np.abs(np.diag(rest)), 1e-12 * np.abs(np.diag(information))))
         scaled = rest / np.outer(scale, scale)
-        shifts.append(np.linalg.lstsq(scaled, sums[key] / scale, rcond=1e-10)[0] / scale)
+        solved = np.linalg.lstsq(scaled, np.column_stack([sums[key] / scale, np.eye(p)]), rcond=1e-10)[0]
+        shifts.append(solved[:, 0] / scale)
+        without += np.diag(solved[:, 1:]) / scale**2 - np.diag(bread)
     count = len(shifts)
     stacked = np.array(shifts)
     matrix = (count - 1) / count * (stacked.T @ stacked)
+    if matrices is None:
+        spread = np.einsum("ij,jk,ik->i", bread, sum(normals.values()), bread)
+        ratio = 1.0 / np.sqrt(_by_leverage((count - 1) / count * without, spread))
+        matrix = matrix * np.outer(ratio, ratio)
     freedom, how = max(1.0, count - 1.0), ""
     if consumed is not None and 2 < count < _MANY_BLOCKS:
         plain = np.einsum("ij,jk,ik->i", bread, _stationary(problem, coefficients, consumed, matrices), bread)
@@ -220,6 +226,17 @@ def jackknife(
         "robust to serial correlation"
     )
     return Covariance(matrix, kind, degrees_of_freedom=freedom)
+
+
+def _by_leverage(expected: Floats, plain: Floats) -> Floats:
+    """Excess (p,) of a jackknife's variances by the leverage of its blocks, over the median parameter's.
+
+    expected, plain : (p,) of independent residuals, of the jackknife and of the estimate itself. The jackknife is too
+    wide by `expected / plain`, a few per cent for a friction and three quarters for a payload that few blocks show.
+    The median stays as a margin for what no block shows.
+    """
+    excess = np.maximum(expected, plain) / np.maximum(plain, 1e-300)
+    return np.asarray(excess / np.median(excess))
 
 
 def moderated(variance: Floats, plain: Floats, freedom: float) -> tuple[Floats, float]:

@@ -9,6 +9,9 @@ since friction turns there in an unknown way: with them a healthy channel looks 
 terms pass the same low-pass. d solves a small nonlinear least-squares problem (Gauss-Newton from a grid); its
 standard deviation is robust to serial correlation and inflated by the scatter of the joints. An unknown delay biases
 Ia by -Fvm d, so its uncertainty enters the covariance of every estimate.
+
+The motors turn ahead of their links by tau_l / k. An error of the stated compliance makes a joint look late by about
+Fvm times that error, another one for each joint, so the joints count with this uncertainty beside their own.
 """
 
 from __future__ import annotations
@@ -45,6 +48,8 @@ _LEAST_ROWS = 16
 _STEP_S = 1e-3
 # Largest Fvm / stiffness of strain-wave joints, 17 Nm s/rad over 8 kNm/rad: so early an elastic joint looks [s].
 _ELASTIC_S = 2e-3
+# Standard deviation of a stated compliance, as a share of it: within a class of arms stiffness differs by 1.5 times.
+COMPLIANCE_SHARE = 0.3
 # Likelihood ratio (twice the log) of a delay at the edge of the search against none that is no chance.
 _DECISIVE = 25.0
 # A delay within this many standard deviations of zero is not told apart from zero.
@@ -134,19 +139,26 @@ def estimate_delay(
     *,
     cutoff_hz: float = 5.0,
     search_s: float = 0.1,
+    compliance: Floats | None = None,
 ) -> Delay:
     """Delay d of the motor channel: tau_m(t + d) belongs to the joint state at t; of equal data estimated once.
+
+    compliance : (J,) stated for the motion of the motors [rad/Nm], None where motors and links move alike.
 
     A motion too short or too weak for an estimate gives zero, with the sample time of the motor channel as its
     standard deviation. Raises DataError when the data clearly prefer a delay at the edge of +- `search_s`.
     """
-    found = _estimates.of(_estimated, stretches, tuple(joint_names), cutoff_hz, search_s)
+    found = _estimates.of(_estimated, stretches, tuple(joint_names), cutoff_hz, search_s, compliance)
     logger.info("motor channel %s", found)
     return found
 
 
 def _estimated(
-    stretches: Sequence[DelayData], joint_names: Sequence[str], cutoff_hz: float, search_s: float
+    stretches: Sequence[DelayData],
+    joint_names: Sequence[str],
+    cutoff_hz: float,
+    search_s: float,
+    compliance: Floats | None,
 ) -> Delay:
     by_stretch = [list(blocks) for _, blocks in groupby(stretches, key=lambda data: data.span)]
     parts = [part for blocks in by_stretch if (part := _Rows.of(blocks, cutoff_hz, search_s)) is not None]
@@ -169,22 +181,27 @@ def _estimated(
             f"{1e3 * grid[best]:.0f} ms; check the channel's clock and sign, raise `delay_search_s`, or "
             "state `motor_delay_s`"
         )
-    delay, std = float(grid[best]), 1.0
+    delay = float(grid[best])
     for _ in range(_STEPS):
-        steps, stds = _newton(parts, joints, delay, separate=False)
-        std = float(stds[0])
+        steps, stds, _ = _newton(parts, joints, delay, separate=False)
         delay = float(np.clip(delay + np.clip(steps[0], -0.01, 0.01), -search_s, search_s))
-        if abs(steps[0]) < max(0.03 * std, 1e-9):
+        if abs(steps[0]) < max(0.03 * float(stds[0]), 1e-9):
             break
-    steps, stds = _newton(parts, joints, delay, separate=True)
-    mean = float(np.sum(steps / stds**2) / np.sum(1.0 / stds**2))
-    chi = float(np.sqrt(np.sum(((steps - mean) / stds) ** 2) / max(len(steps) - 1, 1)))
+    steps, stds, viscous = _newton(parts, joints, delay, separate=True)
+    elastic = 0.0 if compliance is None else COMPLIANCE_SHARE * np.abs(viscous) * compliance[joints]
+    spread = np.hypot(stds, elastic)
+    weights = spread**-2.0
+    mean = float(np.sum(weights * steps) / np.sum(weights))
+    chi = float(np.sqrt(np.sum(weights * (steps - mean) ** 2) / max(len(steps) - 1, 1)))
     disagreement = max(1.0, chi)
     by_joint = {
         joint_names[j]: (delay + float(step), float(s))
-        for j, step, s in zip(joints, steps, stds, strict=True)
+        for j, step, s in zip(joints, steps, spread, strict=True)
     }
-    return Delay.of(delay, std * disagreement, "from the torque difference", by_joint, disagreement)
+    std = float(np.sum(weights)) ** -0.5
+    return Delay.of(
+        delay + mean, std * disagreement, "from the torque difference", by_joint, disagreement
+    )
 
 
 def _unknown(stretches: Sequence[DelayData], why: str) -> Delay:
@@ -319,8 +336,8 @@ def _misfit(parts: Sequence[_Rows], joints: Sequence[int], delay: float) -> floa
 
 def _newton(
     parts: Sequence[_Rows], joints: Sequence[int], delay: float, *, separate: bool
-) -> tuple[Floats, Floats]:
-    """Gauss-Newton step of the delay (1,), or of each joint's own (J,), and standard deviations [s]."""
+) -> tuple[Floats, Floats, Floats]:
+    """Gauss-Newton step of the delay (1,), or of each joint's own (J,), standard deviations [s], and Fvm (J,)."""
     parts = [part.masked(delay) for part in parts]
     here, later, earlier = ([part.at(delay + shift) for part in parts] for shift in (0.0, _STEP_S, -_STEP_S))
     count = len(joints) if separate else 1
@@ -357,4 +374,5 @@ def _newton(
     titles += [f"delay {k}" for k in range(count)]
     step = parts[0].row_s
     fit = WeightedLeastSquares(CovarianceSettings("hac")).fit(Problem(tuple(titles), tuple(groups), step))
-    return fit.values[-count:], fit.std[-count:]
+    viscous = fit.values[[titles.index(f"Fvm {j}") for j in joints]]
+    return fit.values[-count:], fit.std[-count:], viscous

@@ -36,7 +36,7 @@ from ident.rows.filters import (
     settling,
     thinning,
 )
-from ident.rows.reversals import away_from_reversals
+from ident.rows.reversals import away_from_reversals, turning_reach
 from ident.rows.sample_clock import sample_clock
 from ident.rows.timebase import (
     Outliers,
@@ -257,7 +257,7 @@ def prepare(
         motor_data = (clock.at(motor_data[0], stamps), *motor_data[1:])
     delay = None
     if motor_data is not None:
-        delay = _delay(motor_data, motions, session.joint_names, settings, sensed)
+        delay = _delay(motor_data, motions, session.joint_names, settings, springs, sensed)
         if delay.disagreement > _DISAGREEMENT:
             spread = ", ".join(f"{joint} {1e3 * own:.1f}" for joint, (own, _) in delay.by_joint.items())
             warnings.append(
@@ -366,7 +366,8 @@ class _Motion:
     ) -> _Motion:
         """The samples from span[0] to before span[1], filtered with those around."""
         joints = effort_flags.shape[1]
-        around = int(np.ceil((settling(settings.cutoff, settings.order) + settings.reversal) / part.dt)) + 16
+        seen = turning_reach(settings.reversal, settings.standstill_rad_s)
+        around = int(np.ceil((settling(settings.cutoff, settings.order) + seen) / part.dt)) + 16
         low, high = max(span[0] - around, 0), min(span[1] + around, part.count)
         values = part.part(low, high)
         release(*part.columns)
@@ -650,6 +651,7 @@ def _delay(
     motions: list[_Motion],
     names: tuple[str, ...],
     settings: SignalSettings,
+    springs: Floats | None,
     sensed: bool,
 ) -> Delay:
     if settings.motor_delay_s != "estimate":
@@ -669,6 +671,7 @@ def _delay(
         names,
         cutoff_hz=min(DELAY_HZ, settings.cutoff, 0.2 * rate),
         search_s=settings.delay_search_s,
+        compliance=None if springs is None else 1.0 / springs,
     )
 
 

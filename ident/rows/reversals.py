@@ -9,13 +9,37 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from ident.dynamics.parameters import Floats
 
 
+# Friction of a drive turns over a path: tenths of a milliradian in strain-wave gears, whatever the time it takes.
+TURNING_RAD = 1e-3
+
+
 def away_from_reversals(
     speed: Floats, dt: float, window_s: float, standstill_rad_s: float
 ) -> NDArray[np.bool_]:
     """Samples (n, J) whose joint keeps its direction, faster than standstill, for `window_s` before and after.
 
+    Since its reversal or rest the joint has also gone `TURNING_RAD`; a window of zero leaves out the standstill alone.
+
     speed : (n, J) every `dt` seconds [rad/s].
     """
     size = 2 * round(window_s / dt) + 1
     lowest, highest = minimum_filter1d(speed, size, axis=0), maximum_filter1d(speed, size, axis=0)
-    return np.asarray((lowest > standstill_rad_s) | (highest < -standstill_rad_s))
+    away = np.asarray((lowest > standstill_rad_s) | (highest < -standstill_rad_s))
+    if size > 1:
+        away &= _path(speed, dt, standstill_rad_s) >= TURNING_RAD
+    return away
+
+
+def turning_reach(window_s: float, standstill_rad_s: float) -> float:
+    """Time [s] that `away_from_reversals` looks back and ahead at most."""
+    return window_s + (TURNING_RAD / max(standstill_rad_s, 1e-4) if window_s > 0.0 else 0.0)
+
+
+def _path(speed: Floats, dt: float, standstill_rad_s: float) -> Floats:
+    """Path (n, J) since the joint last reversed or rested [rad]."""
+    way = np.where(np.abs(speed) > standstill_rad_s, np.sign(speed), 0.0)
+    gone = np.cumsum(np.abs(speed), axis=0) * dt
+    turned = np.ones(speed.shape, dtype=bool)
+    turned[1:] = (way[1:] != way[:-1]) | (way[1:] == 0.0)
+    # `gone` only grows, so the largest one at a turn is the last.
+    return np.asarray(gone - np.maximum.accumulate(np.where(turned, gone, 0.0), axis=0))

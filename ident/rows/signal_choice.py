@@ -204,9 +204,8 @@ class _Rows:
         """Measured rows (m,) more than `bins` rows from a reversal."""
         found = self.measured.copy()
         for some in self.stretches:
-            found[some] &= away_from_reversals(self.speed[some, None], 1.0, float(bins), standstill_rad_s)[
-                :, 0
-            ]
+            speed = self.speed[some, None]
+            found[some] &= away_from_reversals(speed, _BIN_S, bins * _BIN_S, standstill_rad_s)[:, 0]
         return found
 
 
