@@ -42,6 +42,8 @@ _MANY_BLOCKS = 60
 _LAGS = 10
 # Degrees of freedom counted as known exactly.
 _MOST_FREEDOM = 1e4
+# Least share of a parameter's variance by the rows; below, the prior alone knows it.
+_SHOWN = 1e-9
 
 
 @dataclass(frozen=True)
@@ -207,9 +209,12 @@ def jackknife(
     stacked = np.array(shifts)
     matrix = (count - 1) / count * (stacked.T @ stacked)
     if matrices is None:
-        spread = np.einsum("ij,jk,ik->i", bread, sum(normals.values()), bread)
-        ratio = 1.0 / np.sqrt(_by_leverage((count - 1) / count * without, spread))
-        matrix = matrix * np.outer(ratio, ratio)
+        plain = np.einsum("ij,jk,ik->i", bread, sum(normals.values()), bread)
+        shown = plain > _SHOWN * np.diag(bread)
+        if shown.any():
+            ratio = np.ones(p)
+            ratio[shown] = _by_leverage((count - 1) / count * without[shown], plain[shown]) ** -0.5
+            matrix = matrix * np.outer(ratio, ratio)
     freedom, how = max(1.0, count - 1.0), ""
     if consumed is not None and 2 < count < _MANY_BLOCKS:
         plain = np.einsum("ij,jk,ik->i", bread, _stationary(problem, coefficients, consumed, matrices), bread)
@@ -235,7 +240,7 @@ def _by_leverage(expected: Floats, plain: Floats) -> Floats:
     wide by `expected / plain`, a few per cent for a friction and three quarters for a payload that few blocks show.
     The median stays as a margin for what no block shows.
     """
-    excess = np.maximum(expected, plain) / np.maximum(plain, 1e-300)
+    excess = np.maximum(expected / plain, 1.0)
     return np.asarray(excess / np.median(excess))
 
 

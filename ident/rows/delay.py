@@ -199,9 +199,7 @@ def _estimated(
         for j, step, s in zip(joints, steps, spread, strict=True)
     }
     std = float(np.sum(weights)) ** -0.5
-    return Delay.of(
-        delay + mean, std * disagreement, "from the torque difference", by_joint, disagreement
-    )
+    return Delay.of(delay + mean, std * disagreement, "from the torque difference", by_joint, disagreement)
 
 
 def _unknown(stretches: Sequence[DelayData], why: str) -> Delay:

@@ -8,7 +8,6 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from ident.dynamics.parameters import Floats
 
-
 # Friction of a drive turns over a path: tenths of a milliradian in strain-wave gears, whatever the time it takes.
 TURNING_RAD = 1e-3
 
@@ -38,8 +37,9 @@ def turning_reach(window_s: float, standstill_rad_s: float) -> float:
 def _path(speed: Floats, dt: float, standstill_rad_s: float) -> Floats:
     """Path (n, J) since the joint last reversed or rested [rad]."""
     way = np.where(np.abs(speed) > standstill_rad_s, np.sign(speed), 0.0)
-    gone = np.cumsum(np.abs(speed), axis=0) * dt
     turned = np.ones(speed.shape, dtype=bool)
     turned[1:] = (way[1:] != way[:-1]) | (way[1:] == 0.0)
-    # `gone` only grows, so the largest one at a turn is the last.
-    return np.asarray(gone - np.maximum.accumulate(np.where(turned, gone, 0.0), axis=0))
+    step = np.abs(speed) * dt
+    gone = np.cumsum(step, axis=0)
+    # `gone` only grows, so the largest one before a turn is the last.
+    return np.asarray(gone - np.maximum.accumulate(np.where(turned, gone - step, 0.0), axis=0))

@@ -55,6 +55,32 @@ def test_the_delay_is_found_over_the_whole_search(delay_s: float):
     assert 1.0 <= found.disagreement < 3.0
 
 
+def test_a_joint_of_doubtful_stiffness_does_not_decide_the_delay():
+    """The motors of joint a are said to turn ahead by its torque over 1250 Nm/rad, and do not.
+
+    Its torque follows the weight of other links too; what is its own position's alone looks like viscous friction.
+    """
+    right, twist = data(0.004), np.array([1.0 / 1250.0, 0.0])
+    weight = np.array([30.0, 0.0])
+    right = replace(
+        right,
+        joint_torque=right.joint_torque + weight * np.sin(2.3 * right.times)[:, None],
+        motor_torque=right.motor_torque + weight * np.sin(2.3 * (right.motor_times - 0.004))[:, None],
+    )
+    assert estimate_delay([right], NAMES).estimate == pytest.approx(0.004, abs=2e-4)
+    rate, change = differentiate(right.joint_torque * twist, DT)
+    wrong = replace(right, qd=right.qd + rate, qdd=right.qdd + change)
+    doubtful = estimate_delay([wrong], NAMES)
+    assert doubtful.disagreement > 10.0
+    assert abs(doubtful.estimate - 0.004) > 2e-4
+    found = estimate_delay([wrong], NAMES, compliance=twist)
+    low, high = found.interval
+    assert low < 0.004 < high
+    assert found.disagreement < 3.0
+    assert found.estimate == pytest.approx(0.004, abs=1e-4)
+    assert found.by_joint["a"][1] == pytest.approx(0.3 * 5.0 * twist[0], rel=0.1)
+
+
 def test_two_stretches_know_more_than_one():
     one, two = data(0.005, 12.0), data(0.005, 24.0, seed=1)
     alone, both = estimate_delay([one], NAMES), estimate_delay([one, two], NAMES)

@@ -30,7 +30,7 @@ from ident.rows.filters import (
 )
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import prepare
-from ident.rows.reversals import away_from_reversals
+from ident.rows.reversals import away_from_reversals, turning_reach
 from ident.rows.sessions import payload_name, require, stated_mass
 from ident.rows.timebase import flag_outliers, sample_period, stretches
 from lwr_driver.session import Phase, Session
@@ -48,6 +48,16 @@ def test_samples_within_the_window_of_a_reversal_and_at_standstill_are_left_out(
         for sign in (1.0, -1.0):
             slow = np.full((5, 1), sign * rate)
             assert away_from_reversals(slow, 0.01, 0.0, 0.002).any() != rests
+
+
+def test_a_slow_joint_has_to_go_on_for_the_path_on_which_friction_turns():
+    speed = np.concatenate([np.zeros(10), np.full(50, 0.01), np.full(50, -0.1)])[:, None]
+    away = away_from_reversals(speed, 0.01, 0.02, 0.002)[:, 0]
+    # 0.1 mrad a sample forwards, so the tenth counts again; backwards 1 mrad, so the window alone.
+    assert np.flatnonzero(away).tolist() == [*range(19, 58), *range(62, 110)]
+    assert away_from_reversals(speed, 0.01, 0.0, 0.002)[10:].all()
+    assert turning_reach(0.02, 0.002) == pytest.approx(0.52)
+    assert turning_reach(0.0, 0.002) == 0.0
 
 
 # ---- settings and filters ----
