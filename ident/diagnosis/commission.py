@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +22,16 @@ from ident.diagnosis.bench import (
     prepare_bench,
 )
 from ident.diagnosis.broken_data import broken_channels, refuse, without_broken
-from ident.diagnosis.candidates import Trial
+from ident.diagnosis.character import character
 from ident.diagnosis.evidence import Evidence, Floats, Rows
 from ident.diagnosis.nominal import GAIN_STD, Nominal, NominalArm
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
 from ident.diagnosis.reference import DELAY_STD_S, USUAL_DAYS, Reference, habit, shared
-from ident.diagnosis.selection import Claim, gain_rows, gains, select
+from ident.diagnosis.selection import gain_rows, gains, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
-from ident.effects import ELASTICITY, PRESLIDING, entry_of
 from ident.effects.motion import dahl
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
@@ -264,48 +263,6 @@ def commission(
         found,
         model=replace(found.model, provenance=provenance),
         compliance_std=compliance_std([one.compliance for one in several]),
-    )
-
-
-def character(
-    arm: NominalArm, recorded: Sequence[Sequence[SessionRecord]], settings: DiagnosisSettings
-) -> tuple[dict[str, Any], ...]:
-    """Entries of the lasting effects that most of the healthy sets show in the same joint: ripple, Stribeck friction,
-    warmth, habits of the sensors. Their shape is that of the set with the most evidence, their size the mean of all;
-    an effect of another size in each set is no character. Stiffness and presliding are the nominal arm's own."""
-    benches, votes = [], dict[tuple[str, int], list[Claim]]()
-    for recordings in recorded:
-        bench = prepare_bench(arm, recordings, settings, None, None, fit_compliance=False)
-        found = select(bench.dictionary, bench.evidence, settings, None)
-        benches.append((bench, found.nuisance_rows))
-        for claim in found.claims:
-            effect, shape = claim.trial.candidate.effect, claim.trial.shape
-            passing = effect.event or effect.channel or effect.counted or effect.mode(shape) == "between"
-            if not passing and effect not in (ELASTICITY, PRESLIDING):
-                votes.setdefault(claim.trial.candidate.key, []).append(claim)
-    chosen = [max(v, key=lambda c: c.gain).trial for v in votes.values() if 2 * len(v) > len(recorded)]
-    sizes = []
-    for bench, nuisance in benches:
-        columns = [bench.dictionary.rows(t.candidate, t.shape) for t in chosen]
-        bench.evidence.replace([*columns, *nuisance])
-        sizes.append(bench.evidence.coefficients())
-    entries = []
-    for k, trial in enumerate(chosen):
-        each = np.array([size[k] for size in sizes])
-        mean, std = each.mean(axis=0), each.std(axis=0, ddof=1) if len(each) > 1 else np.zeros(each.shape[1])
-        if np.linalg.norm(mean) > _CLEAR * np.linalg.norm(std):
-            entries.append(_entry(trial, mean, std))
-            log.info("character: %s", trial.candidate.key)
-    return tuple(entries)
-
-
-def _entry(trial: Trial, coefficients: Floats, std: Floats) -> dict[str, Any]:
-    """A trial as an entry of a model's effects."""
-    effect, shape = trial.candidate.effect, trial.shape
-    linear = {p.name: (c, s) for p, c, s in zip(effect.linear, coefficients, std, strict=False)}
-    values = linear | {name: (value, 0.0) for name, value in shape.items()}
-    return entry_of(
-        effect, trial.candidate.joints, values, None if shape.form is None else str(shape.form.value)
     )
 
 

@@ -91,7 +91,7 @@ def select(
     dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings, null: Null | None = None
 ) -> Selection:
     """Accept causes one after the other as long as the evidence suffices."""
-    state = _State(dictionary, evidence, settings, null or {})
+    state = State(dictionary, evidence, settings, null or {})
     state.tolerate([])
     first: dict[tuple[str, int], float] = {}
     accepted: list[Trial] = []
@@ -129,7 +129,7 @@ def gains(
     dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings
 ) -> dict[tuple[str, int], float]:
     """Gain of each candidate before any acceptance, for the null of a healthy arm."""
-    found = _State(dictionary, evidence, settings, {}).contenders([])
+    found = State(dictionary, evidence, settings, {}).contenders([])
     return {t.candidate.key: max(t.score.gain, 0.0) for t in found}
 
 
@@ -141,7 +141,7 @@ def best_candidate(
     With noise known from the residual alone, a strong cause counts as noise until it is in the model. Its gain must
     be compared with its own residual.
     """
-    state = _State(dictionary, evidence, settings, {})
+    state = State(dictionary, evidence, settings, {})
     best = next(iter(state.contenders([])), None)
     if best is None or best.score.gain < _LEAST_GAIN:
         return None
@@ -191,7 +191,9 @@ class _Tolerance(NamedTuple):
 
 
 @dataclass(eq=False)
-class _State:
+class State:
+    """What is accepted and tolerated so far, and the candidates beside it."""
+
     dictionary: Dictionary
     evidence: Evidence
     settings: DiagnosisSettings

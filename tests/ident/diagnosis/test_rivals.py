@@ -8,7 +8,7 @@ import numpy as np
 
 from ident.diagnosis import DiagnosisSettings
 from ident.diagnosis.candidates import Candidate, Trial
-from ident.diagnosis.selection import _State
+from ident.diagnosis.selection import State
 from ident.diagnosis.signatures import signature_bench
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, Shape
@@ -21,7 +21,7 @@ def test_two_causes_in_the_same_rows_do_not_compete(make: Callable[..., Session]
         s["motor"][:, 1] += 0.4 * np.sign(v) * np.exp(-np.abs(v) / 0.15) + 0.6 * np.sin(12.0 * q)
 
     bench = signature_bench([make("a.mcap", 1, rough), make("b.mcap", 2, rough, 1)], chain)
-    state = _State(bench.dictionary, bench.evidence, DiagnosisSettings(), {})
+    state = State(bench.dictionary, bench.evidence, DiagnosisSettings(), {})
 
     def trial(cause: str, **shape: float) -> Trial:
         found = bench.dictionary.trial(Candidate(EFFECTS[cause], 1), Shape(**shape))
@@ -41,9 +41,9 @@ def test_best_shapes_are_found_once_beside_the_same_columns_and_anew_beside_othe
 ) -> None:
     bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
 
-    def state() -> _State:
+    def state() -> State:
         causes = bench.dictionary.of(["stribeck", "gear_ripple"])
-        return _State(causes, bench.evidence, DiagnosisSettings(), {})
+        return State(causes, bench.evidence, DiagnosisSettings(), {})
 
     one, other = state(), state()
     one.tolerate([])

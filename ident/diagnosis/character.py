@@ -1,0 +1,243 @@
+"""The lasting effects that healthy sets of sessions have in common: this arm's own, and no fault.
+
+One set seldom shows a small effect clearly. So its evidence is the sum over all sets, and its size has to be the same
+in each but for their own uncertainty: an effect of another size every day is no property of the arm.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ident.diagnosis.bench import DiagnosisBench, again_with, prepare_bench
+from ident.diagnosis.candidates import Candidate, Trial
+from ident.diagnosis.evidence import Floats
+from ident.diagnosis.nominal import NominalArm
+from ident.diagnosis.recording import SessionRecord
+from ident.diagnosis.selection import Claim, Selection, State
+from ident.diagnosis.settings import DiagnosisSettings
+from ident.effects import EFFECTS, ELASTICITY, PRESLIDING, Shape, entry_of
+from ident.estimators.estimate import fisher_tail
+
+log = logging.getLogger(__name__)
+
+# The mean over the standard deviation from set to set.
+_CLEAR = 3.0
+# Searches, each with the noise that the one before left.
+_SEARCHES = 2
+# Shapes tried in all sets, those of the sets with most evidence.
+_SHAPES = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Size:
+    """Coefficients (k,) of an effect from several sets, their covariance (k, k) and standard deviation from set to set.
+
+    freedom : number of blocks behind the covariance.
+    """
+
+    mean: Floats
+    covariance: Floats
+    from_set_to_set: float
+    freedom: int
+
+    @classmethod
+    def of(cls, values: Sequence[Floats], covariances: Sequence[Floats], blocks: Sequence[int]) -> Size:
+        """Weighted mean of the sets' values (k,) with their own covariances (k, k) (DerSimonian and Laird 1986)."""
+        each, own = np.array(values), np.array([float(np.trace(c)) for c in covariances])
+        between = float(np.sum(np.var(each, axis=0, ddof=1))) if len(each) > 1 else 0.0
+        excess = max(between - float(np.mean(own)), 0.0)
+        weights = 1.0 / np.maximum(own + excess, 1e-300)
+        weights /= weights.sum()
+        covariance = np.einsum("d,dij->ij", weights**2, np.array(covariances))
+        return cls(weights @ each, covariance, float(np.sqrt(excess)), int(np.sum(blocks)))
+
+    @property
+    def lasting(self) -> bool:
+        """Whether it differs little from set to set."""
+        return bool(np.linalg.norm(self.mean) > _CLEAR * self.from_set_to_set)
+
+    @property
+    def p_value(self) -> float:
+        """Probability of such a mean where all are zero."""
+        k = len(self.mean)
+        try:
+            value = float(self.mean @ np.linalg.solve(self.covariance, self.mean))
+        except np.linalg.LinAlgError:
+            return 1.0
+        return fisher_tail(value / k, k, max(self.freedom - k, 1))
+
+
+@dataclass(eq=False)
+class _Set:
+    """A healthy set with what all sets were found to have in common."""
+
+    bench: DiagnosisBench
+    settings: DiagnosisSettings
+    accepted: list[Trial] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.state = State(self.bench.dictionary, self.bench.evidence, self.settings, {})
+
+    def found(self) -> dict[tuple[str, int], Trial]:
+        """The best shape of each candidate beside what was accepted."""
+        self.state.tolerate(self.accepted)
+        taken = {_kind(t.candidate, t.shape) for t in self.accepted}
+        return {
+            t.candidate.key: t
+            for t in self.state.simplest()
+            if _kind(t.candidate, t.shape) not in taken and t.candidate.effect.mode(t.shape) != "between"
+        }
+
+    def trial(self, candidate: Candidate, shape: Shape) -> Trial | None:
+        """A candidate of a given shape beside what was accepted."""
+        return self.bench.dictionary.trial(candidate, shape)
+
+    def quieter(self, causes: Sequence[str]) -> _Set:
+        """The same with the noise that the accepted effects leave."""
+        self.state.tolerate(self.accepted)
+        claims = [Claim(trial, trial.score) for trial in self.accepted]
+        bench = again_with(
+            self.bench, Selection(claims, {}, {}, self.state.nuisance_rows), self.settings, causes
+        )
+        if bench is None:
+            return self
+        again = _Set(bench, self.settings)
+        remade = (again.trial(trial.candidate, trial.shape) for trial in self.accepted)
+        again.accepted = [trial for trial in remade if trial is not None]
+        return again
+
+
+def character(
+    arm: NominalArm, recorded: Sequence[Sequence[SessionRecord]], settings: DiagnosisSettings
+) -> tuple[dict[str, Any], ...]:
+    """Entries of the lasting effects of a healthy arm: ripple, Stribeck friction, warmth, habits of the sensors.
+
+    recorded : sets of sessions, each of one day. Stiffness and presliding are the nominal arm's own and not listed.
+    """
+    causes = [
+        cause for cause, effect in EFFECTS.items() if not (effect.event or effect.channel or effect.counted)
+    ]
+    sets = [
+        _Set(prepare_bench(arm, recordings, settings, None, causes, fit_compliance=False), settings)
+        for recordings in recorded
+    ]
+    chosen: list[tuple[Candidate, Shape]] = []
+    for search in range(_SEARCHES):
+        if search and chosen:
+            sets = [one.quieter(causes) for one in sets]
+        for _ in range(settings.rounds):
+            more = _in_common(sets, settings)
+            for trials in more:
+                candidate, shape = next((t.candidate, t.shape) for t in trials if t is not None)
+                log.info("in common: %s", candidate.key)
+                chosen.append((candidate, shape))
+                for one, trial in zip(sets, trials, strict=True):
+                    one.accepted += [] if trial is None else [trial]
+            if not more:
+                break
+    own = [c for c in chosen if c[0].effect not in (ELASTICITY, PRESLIDING)]
+    return tuple(_entries(sets, own))
+
+
+def _kind(candidate: Candidate, shape: Shape) -> tuple[Any, ...]:
+    """What may be in the model once: a candidate, and a harmonic of its ripple."""
+    continuous = candidate.effect.continuous(shape)
+    return *candidate.key, *((name, value) for name, value in shape.items() if name not in continuous)
+
+
+def _in_common(sets: Sequence[_Set], settings: DiagnosisSettings) -> list[list[Trial | None]]:
+    """Further effects with enough evidence in all sets together, by set; the foremost of each joint."""
+    found = [one.found() for one in sets]
+    total: dict[tuple[str, int], float] = {}
+    for trials in found:
+        for key, trial in trials.items():
+            total[key] = total.get(key, 0.0) + trial.score.gain
+    joints, more = set[int](), list[list[Trial | None]]()
+    for key in sorted(total, key=lambda key: -total[key]):
+        if total[key] <= settings.least_gain:
+            break
+        if key[1] in joints:
+            continue
+        alike = _alike(sets, [trials.get(key) for trials in found], settings)
+        if alike is not None:
+            joints.add(key[1])
+            more.append(alike)
+    return more
+
+
+def _alike(
+    sets: Sequence[_Set], trials: Sequence[Trial | None], settings: DiagnosisSettings
+) -> list[Trial | None] | None:
+    """An effect with one shape in all sets, None without enough evidence; None for a set that contradicts it."""
+    known = [(one, trial) for one, trial in zip(sets, trials, strict=True) if trial is not None]
+    known = sorted(known, key=lambda pair: -pair[1].score.gain)[:_SHAPES]
+    refined = (one.bench.dictionary.refine(trial).shape for one, trial in known)
+    best: list[Trial | None] | None = None
+    for shape in dict.fromkeys([*(trial.shape for _, trial in known), *refined]):
+        tried = [
+            trial if trial is not None and trial.shape == shape else one.trial(known[0][1].candidate, shape)
+            for one, trial in zip(sets, trials, strict=True)
+        ]
+        if best is None or _gain(tried) > _gain(best):
+            best = tried
+    return best if best is not None and _carried(best, settings) else None
+
+
+def _gain(trials: Sequence[Trial | None]) -> float:
+    return sum(t.score.gain for t in trials if t is not None)
+
+
+def _carried(trials: Sequence[Trial | None], settings: DiagnosisSettings) -> bool:
+    """Whether the evidence of all sets together suffices, and most of them bear it out."""
+    scores = [t.score for t in trials if t is not None]
+    if 2 * sum(score.gain > 0.0 for score in scores) <= len(trials):
+        return False
+    size = Size.of(
+        [s.coefficients for s in scores], [s.covariance for s in scores], [s.robust()[1] for s in scores]
+    )
+    strict = next(t.candidate.effect.evidence_factor for t in trials if t is not None)
+    least = strict * (settings.least_gain + 6.0 * (len(size.mean) - 1))
+    visible = float(np.mean([score.inflation for score in scores]))
+    return (
+        _gain(trials) > least
+        and visible > strict * settings.least_inflation
+        and size.p_value < settings.alpha
+        and size.lasting
+    )
+
+
+def _entries(sets: Sequence[_Set], chosen: Sequence[tuple[Candidate, Shape]]) -> list[dict[str, Any]]:
+    """Entries of effects with their sizes fitted together in each set, without those that do not last."""
+    values: list[list[Floats]] = [[] for _ in chosen]
+    own: list[list[Floats]] = [[] for _ in chosen]
+    for one in sets:
+        dictionary, evidence = one.bench.dictionary, one.bench.evidence
+        rows = [dictionary.rows(*each) for each in chosen]
+        evidence.replace([*rows, *one.state.nuisance_rows])
+        covariance, place = evidence.covariance(), evidence.base_count
+        for k, value in enumerate(evidence.coefficients()[: len(chosen)]):
+            here = slice(place, place + len(value))
+            values[k].append(value)
+            own[k].append(covariance[here, here])
+            place = here.stop
+    found = []
+    for (candidate, shape), each, covariances in zip(chosen, values, own, strict=True):
+        size = Size.of(each, covariances, [0] * len(each))
+        if size.lasting:
+            std = np.std(each, axis=0, ddof=1) if len(each) > 1 else np.zeros(len(size.mean))
+            found.append(_entry(candidate, shape, size.mean, std))
+            log.info("character: %s", candidate.key)
+    return found
+
+
+def _entry(candidate: Candidate, shape: Shape, coefficients: Floats, std: Floats) -> dict[str, Any]:
+    """An effect of a model."""
+    effect = candidate.effect
+    linear = {p.name: (c, s) for p, c, s in zip(effect.linear, coefficients, std, strict=False)}
+    values = linear | {name: (value, 0.0) for name, value in shape.items()}
+    return entry_of(effect, candidate.joints, values, None if shape.form is None else str(shape.form.value))
