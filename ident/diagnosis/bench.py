@@ -117,7 +117,7 @@ def prepare_bench(
     evidence, repeatable = _evidence(nominal, settings, None if compared else prior, compared=False)
     for _ in range(rounds):
         nominal.refine(evidence.full.values[: len(base)])
-        evidence, repeatable = _evidence(nominal, settings, prior, compared=compared)
+        evidence, repeatable = _evidence(nominal, settings, prior, compared=compared, healthy=reference)
         if fitted:
             change = _compliance_step(nominal, evidence, arm)
             if np.all(np.abs(change) < 0.03 * arm.compliance):
@@ -154,15 +154,23 @@ def _evidence(
     prior: tuple[Floats, Floats] | None,
     *,
     compared: bool = False,
+    healthy: Reference | None = None,
 ) -> tuple[Evidence, bool]:
-    """Evidence with the noise floor of a first fit. A prior that is not `compared` keeps base parameters with weak
-    excitation near the drawing; repeated periods make their uncertainty known, so it is left out."""
+    """Evidence with the noise floor of a first fit, and no more noise than on the `healthy` arm. A prior that is not
+    `compared` keeps base parameters with weak excitation near the drawing; repeated periods make their uncertainty
+    known, so it is left out."""
     one = {side: np.ones(nominal.arm.chain.n) for side in nominal.rows}
     first = Evidence(nominal, settings, one, one)
     if compared and len(nominal.rows) == 2:
         # Gains of other days are no noise.
         first.replace(list(gain_rows(Dictionary(nominal, first, ())).values()))
     sigma, inflation, floor, repeatable = _noise(nominal, first.residuals())
+    if healthy is not None and not repeatable:
+        # A strong cause is no noise.
+        for side in sigma.keys() & healthy.correlated.keys():
+            quiet = healthy.noise[side] ** 2 * healthy.correlated[side] < sigma[side] ** 2 * inflation[side]
+            sigma[side] = np.where(quiet, healthy.noise[side], sigma[side])
+            inflation[side] = np.where(quiet, healthy.correlated[side], inflation[side])
     if repeatable and not compared:
         prior = None
     return Evidence(nominal, settings, sigma, inflation, prior, compared=compared, floor=floor), repeatable

@@ -167,7 +167,8 @@ def with_far_presliding(arm: NominalArm, days: Sequence[SlowTurns], coulomb: Seq
 
 @dataclass(frozen=True, eq=False)
 class _Day:
-    """Results of one set: base parameters (p,) and covariance (p, p), noise of a row by side, Coulomb friction of the
+    """Results of one set: base parameters (p,) and covariance (p, p), noise of a row by side and the rows that count as
+    one for it, Coulomb friction of the
     drives (n,) [Nm] and its slow part, see `slow_turns`; delays of the channels beyond the arm's, with standard
     deviation, by side [s]. torque_rms : of the rows by side, (n,) [Nm]. masses : announced, of its payloads [kg].
     gains : (2, n) errors of the torque sensors' gains with standard deviations, NaN where unknown.
@@ -178,6 +179,7 @@ class _Day:
     values: Floats
     covariance: Floats
     sigma: Mapping[str, Floats]
+    correlated: Mapping[str, Floats]
     torque_rms: Mapping[str, Floats]
     coulomb: Floats
     slow_turns: SlowTurns
@@ -325,6 +327,7 @@ def _day(
         evidence.full.values[:p].copy(),
         evidence.covariance()[:p, :p],
         evidence.sigma,
+        evidence.variance_inflation,
         {side: np.sqrt(np.mean(rows.target**2, axis=0)) for side, rows in bench.nominal.rows.items()},
         bench.nominal.motions[0].motor_coulomb,
         slow_turns(bench.nominal, bench.evidence),
@@ -400,6 +403,11 @@ def _reference(
         habits=True,
         masses=usual.masses,
         gain_std=gain_std([day.gains for day in days]),
+        correlated={
+            side: np.mean([day.correlated[side] * day.sigma[side] ** 2 for day in days], axis=0)
+            / noise[side] ** 2
+            for side in noise
+        },
     )
 
 

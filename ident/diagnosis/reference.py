@@ -59,8 +59,9 @@ class Reference:
     """A healthy arm.
 
     model : its identified model. compliance : (n,) [rad/Nm]. motor_delay_s, joint_delay_s : of its channels.
-    noise : of a row [Nm] by side, (n,). null : mean gain of each candidate by (cause, joint from 0).
-    sets : number of healthy sets of sessions behind the null. encoder : `link` or `motor`, see `nominal.Arm`.
+    noise : of a row [Nm] by side, (n,). correlated : number of rows that count as one for it, by side, (n,).
+    null : mean gain of each candidate by (cause, joint from 0). sets : number of healthy sets of sessions behind the
+    null. encoder : `link` or `motor`, see `nominal.Arm`.
     presliding : (n,) presliding length [rad], None if unknown. far, far_share : (n,) see `nominal.Arm`.
     delay_std_s : of the channels' delays from day to day, by side. habits : whether the covariance of the model holds
     the changes from day to day. masses : announced, of its payloads [kg].
@@ -85,6 +86,7 @@ class Reference:
     masses: Mapping[str, float | None] = field(default_factory=dict)
     gain_std: float = GAIN_STD
     compliance_std: Floats | None = None
+    correlated: Mapping[str, Floats] = field(default_factory=dict)
 
     @property
     def unknown_stiffness(self) -> tuple[str, ...]:
@@ -126,6 +128,7 @@ class Reference:
             null = {_split(key): float(value) for key, value in stored["null"].items()}
             compliance = np.array(stored["compliance"], dtype=np.float64)
             noise = {side: np.array(v, dtype=np.float64) for side, v in stored["noise"].items()}
+            correlated = {side: np.array(v, dtype=float) for side, v in stored.get("correlated", {}).items()}
             delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
             delay_std = {side: float(v) for side, v in stored.get("delay_std_s", {}).items()}
             sets, encoder = int(stored["sets"]), str(stored["encoder"])
@@ -159,6 +162,7 @@ class Reference:
             masses,
             float(stored.get("gain_std", GAIN_STD)),
             compliance_std,
+            correlated,
         )
 
     def stored(self) -> dict[str, Any]:
@@ -170,7 +174,8 @@ class Reference:
                 "motor_delay_s": self.motor_delay_s,
                 "joint_delay_s": self.joint_delay_s,
                 "delay_std_s": dict(self.delay_std_s),
-                "noise": {side: [float(v) for v in values] for side, values in self.noise.items()},
+                "noise": {side: _listed(values) for side, values in self.noise.items()},
+                "correlated": {side: _listed(values) for side, values in self.correlated.items()},
                 "null": {
                     f"{cause} {joint + 1}": round(float(v), 2) for (cause, joint), v in self.null.items()
                 },
