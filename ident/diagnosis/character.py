@@ -31,6 +31,8 @@ _CLEAR = 3.0
 _SEARCHES = 2
 # Shapes tried in all sets, those of the sets with most evidence.
 _SHAPES = 2
+# Weight of the usual change of a size, in changes.
+_USUAL_CHANGES = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +48,22 @@ class Size:
     freedom: int
 
     @classmethod
-    def of(cls, values: Sequence[Floats], covariances: Sequence[Floats], blocks: Sequence[int]) -> Size:
-        """Weighted mean of the sets' values (k,) with their own covariances (k, k) (DerSimonian and Laird 1986)."""
+    def of(
+        cls,
+        values: Sequence[Floats],
+        covariances: Sequence[Floats],
+        blocks: Sequence[int],
+        usual: float = 0.0,
+    ) -> Size:
+        """Weighted mean of the sets' values (k,) with their own covariances (k, k) (DerSimonian and Laird 1986).
+
+        usual : standard deviation of such a size from day to day on any arm, counted as some further changes.
+        """
         each, own = np.array(values), np.array([float(np.trace(c)) for c in covariances])
         between = float(np.sum(np.var(each, axis=0, ddof=1))) if len(each) > 1 else 0.0
-        excess = max(between - float(np.mean(own)), 0.0)
+        changes, more = len(each) - 1, _USUAL_CHANGES if usual else 0.0
+        excess = changes * max(between - float(np.mean(own)), 0.0) + more * usual**2
+        excess /= max(changes + more, 1.0)
         weights = 1.0 / np.maximum(own + excess, 1e-300)
         weights /= weights.sum()
         covariance = np.einsum("d,dij->ij", weights**2, np.array(covariances))
@@ -197,10 +210,14 @@ def _carried(trials: Sequence[Trial | None], settings: DiagnosisSettings) -> boo
     scores = [t.score for t in trials if t is not None]
     if 2 * sum(score.gain > 0.0 for score in scores) <= len(trials):
         return False
+    effect = next(t.candidate.effect for t in trials if t is not None)
     size = Size.of(
-        [s.coefficients for s in scores], [s.covariance for s in scores], [s.robust()[1] for s in scores]
+        [s.coefficients for s in scores],
+        [s.covariance for s in scores],
+        [s.robust()[1] for s in scores],
+        effect.usual_change,
     )
-    strict = next(t.candidate.effect.evidence_factor for t in trials if t is not None)
+    strict = effect.evidence_factor
     least = strict * (settings.least_gain + 6.0 * (len(size.mean) - 1))
     visible = float(np.mean([score.inflation for score in scores]))
     return (
@@ -227,7 +244,7 @@ def _entries(sets: Sequence[_Set], chosen: Sequence[tuple[Candidate, Shape]]) ->
             place = here.stop
     found = []
     for (candidate, shape), each, covariances in zip(chosen, values, own, strict=True):
-        size = Size.of(each, covariances, [0] * len(each))
+        size = Size.of(each, covariances, [0] * len(each), candidate.effect.usual_change)
         if size.lasting:
             std = np.std(each, axis=0, ddof=1) if len(each) > 1 else np.zeros(len(size.mean))
             found.append(_entry(candidate, shape, size.mean, std))

@@ -402,7 +402,8 @@ def _reference(
         {side: delay_std([day.late[side] for day in days]) for side in _CHANNELS},
         habits=True,
         masses=usual.masses,
-        gain_std=gain_std([day.gains for day in days]),
+        # Of a further day against the mean of these.
+        gain_std=gain_std([day.gains for day in days]) * float(np.sqrt(1.0 + 1.0 / len(days))),
         correlated={
             side: np.mean([day.correlated[side] * day.sigma[side] ** 2 for day in days], axis=0)
             / noise[side] ** 2

@@ -29,7 +29,7 @@ from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, Coupling, DriveMotion, ModelStructure, Side
-from ident.effects import Column, effects_torque
+from ident.effects import SENSOR_GAIN, Column, effects_torque
 from ident.effects.motion import ArmMotion, dahl, in_order
 from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
@@ -57,8 +57,8 @@ _RELAXATION_S = 2e-3
 _LEAST_MASS = 1e-3
 # A joint within this range carries no information on its friction, gears and cables.
 TRAVEL_RAD = 0.1
-# Usual standard deviation of a torque sensor's gain from day to day: within a per cent, evenly.
-GAIN_STD = 0.01 / np.sqrt(3.0)
+GAIN_STD = SENSOR_GAIN.usual_change
+"""Usual standard deviation of a torque sensor's gain from day to day."""
 
 
 @dataclass(frozen=True, eq=False)

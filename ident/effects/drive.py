@@ -516,6 +516,7 @@ class ScaleError(Effect):
     law = Law("load")
     experiment = Discriminator.STATIC_POSES
     every_payload = True
+    usual_change = 0.01 / 3.0**0.5  # within a per cent, evenly
     tell_apart = "static poses of joint {joint} with a weighed mass and without it"
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:

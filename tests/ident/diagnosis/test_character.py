@@ -1,0 +1,86 @@
+"""What healthy sets of sessions have in common belongs to the arm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from ident.diagnosis import commission
+from ident.diagnosis.candidates import Candidate, Trial
+from ident.diagnosis.character import Size, _carried, _kind
+from ident.diagnosis.evidence import Score
+from ident.diagnosis.settings import DiagnosisSettings
+from ident.dynamics.kinematics import Chain
+from ident.effects import EFFECTS, Shape
+from lwr_driver.session import Session
+
+Make = Callable[..., Session]
+Signals = dict[str, np.ndarray]
+STRIBECK = Candidate(EFFECTS["stribeck"], 1)
+
+
+def trial(value: float, gain: float, std: float = 0.1, blocks: int = 40) -> Trial:
+    score = Score(gain, gain, np.array([value]), 0.02, lambda: (np.array([[std**2]]), blocks))
+    return Trial(STRIBECK, Shape(velocity=0.1, exponent=1.0), score, {})
+
+
+def test_the_size_of_an_effect_is_the_weighted_mean_of_its_sets() -> None:
+    one = Size.of([np.array([1.0]), np.array([2.0])], [np.eye(1) * 0.01, np.eye(1) * 0.04], [40, 50])
+    # Variances of 0.01 and 0.04, and 0.475 between the sets beyond their mean.
+    weights = np.array([1.0 / 0.485, 1.0 / 0.515])
+    assert one.mean == pytest.approx([float(weights @ [1.0, 2.0] / weights.sum())])
+    assert one.from_set_to_set == pytest.approx(np.sqrt(0.475))
+    assert one.freedom == 90
+    assert not one.lasting
+    alike = Size.of([np.array([1.0]), np.array([1.05])], [np.eye(1) * 0.01] * 2, [40, 40])
+    assert alike.from_set_to_set == 0.0
+    assert alike.lasting
+    assert alike.covariance == pytest.approx(np.eye(1) * 0.005)
+    assert alike.p_value < 1e-10
+
+
+def test_evidence_too_weak_in_each_set_suffices_in_all_together() -> None:
+    settings = DiagnosisSettings()
+    assert not _carried([trial(0.4, 14.0)], settings)
+    assert _carried([trial(value, 14.0) for value in (0.4, 0.45, 0.38)], settings)
+
+
+def test_an_effect_of_another_size_in_each_set_or_without_a_majority_is_none_of_the_arm() -> None:
+    settings = DiagnosisSettings()
+    assert not _carried([trial(value, 40.0) for value in (0.9, 0.1, -0.6)], settings)
+    assert not _carried([trial(0.9, 90.0), trial(0.9, -1.0), None, trial(0.9, 90.0)], settings)
+    assert _carried([trial(0.9, 90.0), trial(0.9, 90.0), None, trial(0.9, 90.0)], settings)
+
+
+def test_each_harmonic_of_a_ripple_may_be_in_the_model() -> None:
+    ripple, shape = Candidate(EFFECTS["gear_ripple"], 2), Shape(cycles_per_turn=1.0, gear_ratio=100.0)
+    assert _kind(ripple, shape) != _kind(ripple, shape.at(cycles_per_turn=2.0))
+    assert _kind(STRIBECK, Shape(velocity=0.1, exponent=1.0)) == _kind(
+        STRIBECK, Shape(velocity=0.2, exponent=2.0)
+    )
+
+
+def test_friction_that_all_healthy_days_show_is_in_the_reference_and_what_comes_and_goes_is_not(
+    make: Make, chain: Chain
+) -> None:
+    def days(amplitudes: tuple[float, ...]) -> list[list[Session]]:
+        def change(amplitude: float) -> Callable[[Signals], None]:
+            def stick(s: Signals) -> None:
+                v = s["qd"][:, 1]
+                s["motor"][:, 1] += amplitude * np.sign(v) * np.exp(-np.abs(v) / 0.1)
+
+            return stick
+
+        return [
+            [
+                make("a.mcap", 11 + 10 * k, change(amplitude)),
+                make("b.mcap", 12 + 10 * k, change(amplitude), 1),
+            ]
+            for k, amplitude in enumerate(amplitudes)
+        ]
+
+    lasting = commission(days((0.12, 0.12)), chain).model.effects
+    assert [(entry["cause"], entry["joints"]) for entry in lasting] == [("stribeck", [2])]
+    assert not commission(days((0.12, -0.12)), chain).model.effects
