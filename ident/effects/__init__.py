@@ -38,6 +38,7 @@ __all__ = [
     "ELASTICITY",
     "FRICTION_TEMPERATURE",
     "LOST_SAMPLES",
+    "MOTOR_GAIN",
     "NAMELESS",
     "PRESLIDING",
     "SENSOR_GAIN",
@@ -70,6 +71,7 @@ PRESLIDING = drive.PreslidingHysteresis()
 ELASTICITY = link.JointElasticity()
 BASE_TILT = link.BaseTilt()
 SENSOR_GAIN = channel.SensorGain()
+MOTOR_GAIN = drive.MotorTorqueGain()
 ZERO_OFFSET = link.JointZeroOffset()
 LOST_SAMPLES = channel.LostSamples()
 DELAYS = {"motor": channel.MotorTorqueDelay(), "joint": channel.JointTorqueDelay()}
@@ -86,7 +88,7 @@ EFFECTS: dict[str, Effect] = {
         drive.FrictionPosition(),
         PRESLIDING,
         drive.GearRipple(),
-        drive.MotorTorqueGain(),
+        MOTOR_GAIN,
         link.Backlash(),
         ELASTICITY,
         link.CableSpring(),
