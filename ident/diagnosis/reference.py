@@ -196,10 +196,12 @@ class Reference:
         The gain of a candidate differs between healthy sets, for the arm is never quite the nominal one. It is
         modelled as the square of a normally distributed deviation. Then the gain of a further set over the mean of
         `sets` of them has Fisher's distribution F(1, sets). The mean of a few sets is uncertain, so the mean of the
-        same cause over all joints counts as further sets.
+        same cause over all joints counts as further sets. Each of the n sets was held against the others; a further one
+        is held against all, and deviates from their mean by 1 - 1/n^2 of that in square.
         """
         if not self.sets:
             return {}
+        further = 1.0 - self.sets**-2.0 if self.sets > 1 else 1.0
         by_cause: dict[str, list[float]] = {}
         for (cause, _), gain in self.null.items():
             by_cause.setdefault(cause, []).append(gain)
@@ -213,7 +215,7 @@ class Reference:
         found = {}
         for key, gain in self.null.items():
             mean = (self.sets * gain + _AS_SETS * float(np.mean(by_cause[key[0]]))) / sets
-            found[key] = noise + (function if key[0] in terms else single) * max(mean - noise, 0.0)
+            found[key] = noise + (function if key[0] in terms else single) * further * max(mean - noise, 0.0)
         # On a healthy arm a cause reaches at least the gain of its special cases, and is not counted beside them.
         for effect in EFFECTS.values():
             for case in effect.contains:
