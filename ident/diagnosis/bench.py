@@ -18,7 +18,7 @@ from ident.diagnosis.selection import Selection, gain_rows
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling, Side
-from ident.effects import DELAYS, ELASTICITY, MOTOR_GAIN, SENSOR_GAIN, Shape
+from ident.effects import DELAYS, ELASTICITY, Shape
 from ident.estimators.physical import cad_prior
 
 _BySide = dict[str, Floats]
@@ -163,8 +163,7 @@ def _evidence(
     first = Evidence(nominal, settings, one, one)
     if compared and len(nominal.rows) == 2:
         # Gains of other days are no noise.
-        dictionary = Dictionary(nominal, first, ())
-        first.replace([r for e in (SENSOR_GAIN, MOTOR_GAIN) for r in gain_rows(dictionary, e).values()])
+        first.replace(list(gain_rows(Dictionary(nominal, first, ())).values()))
     sigma, inflation, floor, repeatable = _noise(nominal, first.residuals())
     if healthy is not None and not repeatable:
         # A strong cause is no noise.

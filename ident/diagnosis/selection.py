@@ -19,8 +19,7 @@ from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.effects import DELAYS, ELASTICITY, MOTOR_GAIN, SENSOR_GAIN, Shape
-from ident.effects.drive import ScaleError
+from ident.effects import DELAYS, ELASTICITY, SENSOR_GAIN, Shape
 from ident.estimators.estimate import normal_tail
 
 log = logging.getLogger(__name__)
@@ -43,7 +42,7 @@ _LEAST_GAIN = 10.0
 _KNOWN_DELAY = 0.4
 # The same for a stiffness behind published motors.
 _KNOWN_COMPLIANCE = 0.4
-# Largest gain error of a torque sensor or a drive as one of other days, in their standard deviations.
+# Largest gain error of a torque sensor as one of other days, in their standard deviations.
 _HABITUAL = 3.0
 # Confidence in a sensor's error with a record of the joint torque only.
 _SHAPE_ALONE = 0.7
@@ -118,13 +117,11 @@ def select(
     return Selection(claims, state.nuisance, first, state.nuisance_rows)
 
 
-def gain_rows(dictionary: Dictionary, effect: ScaleError = SENSOR_GAIN) -> dict[int, Rows]:
-    """Rows of an error of the gain of the torque sensor or the drive, by joint from 0, where its channel shows
-    anything."""
+def gain_rows(dictionary: Dictionary) -> dict[int, Rows]:
+    """Rows of an error of the torque sensor's gain, by joint from 0, where the sensor shows anything."""
     mask = dictionary.evidence.mask
-    side = "motor" if effect.side == "motor" else "joint"
-    joints = [j for at, j in mask if at == side and mask[at, j].any()]
-    found = {j: dictionary.rows(Candidate(effect, j), Shape()) for j in joints}
+    joints = [j for side, j in mask if side == "joint" and mask[side, j].any()]
+    found = {j: dictionary.rows(Candidate(SENSOR_GAIN, j), Shape()) for j in joints}
     return {j: rows for j, rows in found.items() if rows}
 
 
@@ -236,9 +233,8 @@ class State:
             # Without a reference the gains of the sensors are hardly distinguishable from a scale of all masses.
             size = _HABITUAL * nominal.arm.gain_std
             found += [
-                _Tolerance(f"{name} {j + 1}", rows, 1.0, size, (effect.cause, j))
-                for name, effect in ((GAIN, SENSOR_GAIN), ("motor gain", MOTOR_GAIN))
-                for j, rows in gain_rows(self.dictionary, effect).items()
+                _Tolerance(f"{GAIN} {j + 1}", rows, 1.0, size, (SENSOR_GAIN.cause, j))
+                for j, rows in gain_rows(self.dictionary).items()
             ]
         self._tolerances = found
         return found

@@ -38,7 +38,6 @@ __all__ = [
     "ELASTICITY",
     "FRICTION_TEMPERATURE",
     "LOST_SAMPLES",
-    "MOTOR_GAIN",
     "NAMELESS",
     "PRESLIDING",
     "SENSOR_GAIN",
@@ -71,7 +70,6 @@ PRESLIDING = drive.PreslidingHysteresis()
 ELASTICITY = link.JointElasticity()
 BASE_TILT = link.BaseTilt()
 SENSOR_GAIN = channel.SensorGain()
-MOTOR_GAIN = drive.MotorTorqueGain()
 ZERO_OFFSET = link.JointZeroOffset()
 LOST_SAMPLES = channel.LostSamples()
 DELAYS = {"motor": channel.MotorTorqueDelay(), "joint": channel.JointTorqueDelay()}
@@ -88,7 +86,7 @@ EFFECTS: dict[str, Effect] = {
         drive.FrictionPosition(),
         PRESLIDING,
         drive.GearRipple(),
-        MOTOR_GAIN,
+        drive.MotorTorqueGain(),
         link.Backlash(),
         ELASTICITY,
         link.CableSpring(),
