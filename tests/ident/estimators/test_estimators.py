@@ -200,7 +200,7 @@ def test_hac_is_the_double_sum_of_its_definition():
     np.testing.assert_allclose(estimate.covariance.matrix, bread @ meat @ bread.T, rtol=1e-9, atol=1e-15)
 
 
-def test_jackknife_is_the_scatter_of_estimates_without_a_block_by_leverage():
+def test_jackknife_is_the_scatter_of_estimates_without_a_block():
     matrices = design(records=1, samples=64)
     case = problem(matrices, CHI, white(4, matrices))
     estimate = WeightedLeastSquares(CovarianceSettings("jackknife", block_s=0.2)).fit(case)
