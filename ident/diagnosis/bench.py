@@ -114,10 +114,10 @@ def prepare_bench(
     # Predictions of the second round include the reference; a third changes nothing.
     rounds = 3 if fitted else 2 if reference is not None else 1
     compared = reference is not None
-    evidence, repeatable = _evidence(nominal, settings, None if compared else prior, compared=False)
+    evidence, repeatable = _evidence(nominal, settings, None if compared else prior)
     for _ in range(rounds):
         nominal.refine(evidence.full.values[: len(base)])
-        evidence, repeatable = _evidence(nominal, settings, prior, compared=compared, healthy=reference)
+        evidence, repeatable = _evidence(nominal, settings, prior, reference)
         if fitted:
             change = _compliance_step(nominal, evidence, arm)
             if np.all(np.abs(change) < 0.03 * arm.compliance):
@@ -152,13 +152,12 @@ def _evidence(
     nominal: Nominal,
     settings: DiagnosisSettings,
     prior: tuple[Floats, Floats] | None,
-    *,
-    compared: bool = False,
     healthy: Reference | None = None,
 ) -> tuple[Evidence, bool]:
-    """Evidence with the noise floor of a first fit, and no more noise than on the `healthy` arm. A prior that is not
-    `compared` keeps base parameters with weak excitation near the drawing; repeated periods make their uncertainty
-    known, so it is left out."""
+    """Evidence with the noise floor of a first fit, and no more noise than on the `healthy` arm. Without one the prior
+    keeps base parameters with weak excitation near the drawing; repeated periods make their uncertainty known, so it is
+    left out."""
+    compared = healthy is not None
     one = {side: np.ones(nominal.arm.chain.n) for side in nominal.rows}
     first = Evidence(nominal, settings, one, one)
     if compared and len(nominal.rows) == 2:

@@ -15,13 +15,13 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench, again_with, prepare_bench
 from ident.diagnosis.candidates import Candidate, Trial
-from ident.diagnosis.evidence import Floats
+from ident.diagnosis.evidence import Floats, chance
 from ident.diagnosis.nominal import NominalArm
 from ident.diagnosis.recording import SessionRecord
+from ident.diagnosis.reference import USUAL_CHANGES
 from ident.diagnosis.selection import Claim, Selection, State
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import EFFECTS, ELASTICITY, PRESLIDING, Shape, entry_of
-from ident.estimators.estimate import fisher_tail
 
 log = logging.getLogger(__name__)
 
@@ -31,29 +31,28 @@ _CLEAR = 3.0
 _SEARCHES = 2
 # Shapes tried in all sets, those of the sets with most evidence.
 _SHAPES = 2
-# Weight of the usual change of a size, in changes.
-_USUAL_CHANGES = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Size:
     """Coefficients (k,) of an effect from several sets, their covariance (k, k) and standard deviation from set to set.
 
-    freedom : number of blocks behind the covariance.
+    blocks : behind the covariance.
     """
 
     mean: Floats
     covariance: Floats
     from_set_to_set: float
-    freedom: int
+    blocks: int
 
     @classmethod
     def of(
         cls,
         values: Sequence[Floats],
         covariances: Sequence[Floats],
-        blocks: Sequence[int],
         usual: float = 0.0,
+        *,
+        blocks: int = 0,
     ) -> Size:
         """Weighted mean of the sets' values (k,) with their own covariances (k, k) (DerSimonian and Laird 1986).
 
@@ -61,13 +60,13 @@ class Size:
         """
         each, own = np.array(values), np.array([float(np.trace(c)) for c in covariances])
         between = float(np.sum(np.var(each, axis=0, ddof=1))) if len(each) > 1 else 0.0
-        changes, more = len(each) - 1, _USUAL_CHANGES if usual else 0.0
+        changes, more = len(each) - 1, USUAL_CHANGES if usual else 0.0
         excess = changes * max(between - float(np.mean(own)), 0.0) + more * usual**2
         excess /= max(changes + more, 1.0)
         weights = 1.0 / np.maximum(own + excess, 1e-300)
         weights /= weights.sum()
         covariance = np.einsum("d,dij->ij", weights**2, np.array(covariances))
-        return cls(weights @ each, covariance, float(np.sqrt(excess)), int(np.sum(blocks)))
+        return cls(weights @ each, covariance, float(np.sqrt(excess)), blocks)
 
     @property
     def lasting(self) -> bool:
@@ -77,12 +76,7 @@ class Size:
     @property
     def p_value(self) -> float:
         """Probability of such a mean where all are zero."""
-        k = len(self.mean)
-        try:
-            value = float(self.mean @ np.linalg.solve(self.covariance, self.mean))
-        except np.linalg.LinAlgError:
-            return 1.0
-        return fisher_tail(value / k, k, max(self.freedom - k, 1))
+        return chance(self.mean, self.covariance, self.blocks)
 
 
 @dataclass(eq=False)
@@ -214,8 +208,8 @@ def _carried(trials: Sequence[Trial | None], settings: DiagnosisSettings) -> boo
     size = Size.of(
         [s.coefficients for s in scores],
         [s.covariance for s in scores],
-        [s.robust()[1] for s in scores],
         effect.usual_change,
+        blocks=sum(s.robust()[1] for s in scores),
     )
     strict = effect.evidence_factor
     least = strict * (settings.least_gain + 6.0 * (len(size.mean) - 1))
@@ -244,7 +238,7 @@ def _entries(sets: Sequence[_Set], chosen: Sequence[tuple[Candidate, Shape]]) ->
             place = here.stop
     found = []
     for (candidate, shape), each, covariances in zip(chosen, values, own, strict=True):
-        size = Size.of(each, covariances, [0] * len(each), candidate.effect.usual_change)
+        size = Size.of(each, covariances, candidate.effect.usual_change)
         if size.lasting:
             std = np.std(each, axis=0, ddof=1) if len(each) > 1 else np.zeros(len(size.mean))
             found.append(_entry(candidate, shape, size.mean, std))

@@ -27,7 +27,7 @@ from ident.diagnosis.evidence import Evidence, Floats, Rows
 from ident.diagnosis.nominal import GAIN_STD, Nominal, NominalArm
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
-from ident.diagnosis.reference import DELAY_STD_S, USUAL_DAYS, Reference, habit, shared
+from ident.diagnosis.reference import DELAY_STD_S, USUAL_CHANGES, USUAL_DAYS, Reference, habit, shared
 from ident.diagnosis.selection import gain_rows, gains, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
@@ -54,8 +54,6 @@ _TUNING_SETS = 3
 _ROUNDS = 3
 _LATEST_S = 0.02
 _CHANNELS = ("motor", "joint")
-# Weight of the usual change of a gain, in changes.
-_USUAL_GAINS = 2.0
 
 SlowTurns = NDArray[np.float64]
 """(2, longer distances, n): slowly reversing Coulomb friction [Nm], and its standard deviation."""
@@ -168,9 +166,9 @@ def with_far_presliding(arm: NominalArm, days: Sequence[SlowTurns], coulomb: Seq
 @dataclass(frozen=True, eq=False)
 class _Day:
     """Results of one set: base parameters (p,) and covariance (p, p), noise of a row by side and the rows that count as
-    one for it, Coulomb friction of the
-    drives (n,) [Nm] and its slow part, see `slow_turns`; delays of the channels beyond the arm's, with standard
-    deviation, by side [s]. torque_rms : of the rows by side, (n,) [Nm]. masses : announced, of its payloads [kg].
+    one for it, Coulomb friction of the drives (n,) [Nm] and its slow part, see `slow_turns`; delays of the channels
+    beyond the arm's, with standard deviation, by side [s]. torque_rms : of the rows by side, (n,) [Nm]. masses :
+    announced, of its payloads [kg].
     gains : (2, n) errors of the torque sensors' gains with standard deviations, NaN where unknown.
     """
 
@@ -457,8 +455,8 @@ def gain_std(days: Sequence[Floats]) -> float:
     scatter = np.nansum((values - np.nanmean(values, axis=0)) ** 2, axis=0) - changes * np.nanmean(
         own, axis=0
     )
-    total = _USUAL_GAINS * GAIN_STD**2 + max(float(scatter.sum()), 0.0)
-    return float(np.sqrt(total / (_USUAL_GAINS + changes.sum())))
+    total = USUAL_CHANGES * GAIN_STD**2 + max(float(scatter.sum()), 0.0)
+    return float(np.sqrt(total / (USUAL_CHANGES + changes.sum())))
 
 
 def _sound(matrix: Floats) -> Floats:

@@ -70,12 +70,17 @@ class Score:
         """Probability of such coefficients where all are zero."""
         if self.chance is not None:
             return self.chance
-        (covariance, active), k = self._robust, len(self.coefficients)
-        try:
-            value = float(self.coefficients @ np.linalg.solve(covariance, self.coefficients))
-        except np.linalg.LinAlgError:
-            return 1.0
-        return fisher_tail(value / k, k, max(active - k, 1))
+        return chance(self.coefficients, *self._robust)
+
+
+def chance(coefficients: Floats, covariance: Floats, blocks: int) -> float:
+    """Probability of such coefficients (k,) where all are zero; their covariance (k, k) from a number of blocks."""
+    k = len(coefficients)
+    try:
+        value = float(coefficients @ np.linalg.solve(covariance, coefficients))
+    except np.linalg.LinAlgError:
+        return 1.0
+    return fisher_tail(value / k, k, max(blocks - k, 1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,8 @@ INERTIA_BY_PHASE = 0.05
 """Largest effect of the phase of slow motor samples on a drive's inertia, as a share of it."""
 USUAL_DAYS = 4
 """Weight of the usual deviation of a delay, in days."""
+USUAL_CHANGES = 2.0
+"""Weight of the usual change of a parameter, a gain or the size of an effect beside this arm's own, in changes."""
 
 _KEY = "commissioning"
 _WIDER = 1.5
@@ -41,8 +43,6 @@ _USUAL = {"Fvl": 0.087, "Fcl": 0.058, "Fvm": 0.087, "Fcm": 0.058}
 _ELSE = 0.01
 # Offsets have no size of their own: share of the rms torque in their rows.
 _OFFSETS = ("offl", "offm")
-# Weight of the usual change beside that of this arm, in changes of a parameter.
-_USUAL_CHANGES = 2.0
 # Weight of the scatter of a symbol beside that of a parameter, and of the expected scatter beside the symbol's, in
 # changes.
 _ALIKE = 4.0
@@ -306,7 +306,7 @@ def habit(
         changes = int(np.sum(count[telling] - 1))
         scatter = squares[telling] - (count[telling] - 1) * own[telling]
         total = max(float(np.sum(scatter / scale[telling] ** 2)), 0.0)
-        share = (_USUAL_CHANGES * usual[mine][0] ** 2 + total) / (_USUAL_CHANGES + changes)
+        share = (USUAL_CHANGES * usual[mine][0] ** 2 + total) / (USUAL_CHANGES + changes)
         variance[mine] = share * scale[mine] ** 2
         expected = own[mine] + variance[mine]
         excess = squares[mine] / np.maximum(expected, 1e-300)

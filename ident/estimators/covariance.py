@@ -237,7 +237,7 @@ def _by_leverage(expected: Floats, plain: Floats) -> Floats:
     """Excess (p,) of a jackknife's variances by the leverage of its blocks, over the median parameter's.
 
     expected, plain : (p,) of independent residuals, of the jackknife and of the estimate itself. The jackknife is too
-    wide by `expected / plain`, a few per cent for a friction and three quarters for a payload that few blocks show.
+    wide by `expected / plain`, little for a friction and much for a payload that few blocks show.
     The median stays as a margin for what no block shows.
     """
     excess = np.maximum(expected / plain, 1.0)

@@ -49,7 +49,7 @@ _STEP_S = 1e-3
 # Largest Fvm / stiffness of strain-wave joints, 17 Nm s/rad over 8 kNm/rad: so early an elastic joint looks [s].
 _ELASTIC_S = 2e-3
 # Standard deviation of a stated compliance, as a share of it: within a class of arms stiffness differs by 1.5 times.
-COMPLIANCE_SHARE = 0.3
+_COMPLIANCE_SHARE = 0.3
 # Likelihood ratio (twice the log) of a delay at the edge of the search against none that is no chance.
 _DECISIVE = 25.0
 # A delay within this many standard deviations of zero is not told apart from zero.
@@ -64,7 +64,7 @@ class Delay:
 
     seconds : the delay in use [s], zero where the data cannot tell it from zero. std : its standard deviation [s],
         with the uncertainty of a delay that is set to zero. how : origin. estimate : the unrestricted estimate [s].
-    by_joint : delay of each moving joint by itself, and its standard deviation [s].
+    by_joint : delay of each moving joint by itself, and its standard deviation, with that of its compliance [s].
     disagreement : scatter of the joints over their standard deviations; `std` already includes this factor.
     """
 
@@ -188,7 +188,7 @@ def _estimated(
         if abs(steps[0]) < max(0.03 * float(stds[0]), 1e-9):
             break
     steps, stds, viscous = _newton(parts, joints, delay, separate=True)
-    elastic = 0.0 if compliance is None else COMPLIANCE_SHARE * np.abs(viscous) * compliance[joints]
+    elastic = 0.0 if compliance is None else _COMPLIANCE_SHARE * np.abs(viscous) * compliance[joints]
     spread = np.hypot(stds, elastic)
     weights = spread**-2.0
     mean = float(np.sum(weights * steps) / np.sum(weights))

@@ -30,7 +30,7 @@ def away_from_reversals(
 
 
 def turning_reach(window_s: float, standstill_rad_s: float) -> float:
-    """Time [s] that `away_from_reversals` looks back and ahead at most."""
+    """Time [s] that `away_from_reversals` looks back and ahead: that of the path at the slowest speed, 10 s at most."""
     return window_s + (TURNING_RAD / max(standstill_rad_s, 1e-4) if window_s > 0.0 else 0.0)
 
 

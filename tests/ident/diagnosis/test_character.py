@@ -27,14 +27,14 @@ def trial(value: float, gain: float, std: float = 0.1, blocks: int = 40) -> Tria
 
 
 def test_the_size_of_an_effect_is_the_weighted_mean_of_its_sets() -> None:
-    one = Size.of([np.array([1.0]), np.array([2.0])], [np.eye(1) * 0.01, np.eye(1) * 0.04], [40, 50])
+    one = Size.of([np.array([1.0]), np.array([2.0])], [np.eye(1) * 0.01, np.eye(1) * 0.04], blocks=90)
     # Variances of 0.01 and 0.04, and 0.475 between the sets beyond their mean.
     weights = np.array([1.0 / 0.485, 1.0 / 0.515])
     assert one.mean == pytest.approx([float(weights @ [1.0, 2.0] / weights.sum())])
     assert one.from_set_to_set == pytest.approx(np.sqrt(0.475))
-    assert one.freedom == 90
+    assert one.blocks == 90
     assert not one.lasting
-    alike = Size.of([np.array([1.0]), np.array([1.05])], [np.eye(1) * 0.01] * 2, [40, 40])
+    alike = Size.of([np.array([1.0]), np.array([1.05])], [np.eye(1) * 0.01] * 2, blocks=80)
     assert alike.from_set_to_set == 0.0
     assert alike.lasting
     assert alike.covariance == pytest.approx(np.eye(1) * 0.005)
