@@ -114,10 +114,12 @@ def _ended(task: Task, broken: Sequence[BrokenChannel]) -> Diagnosis:
 
 
 def _first(task: Task) -> State:
-    """The first selection, with the noise from the best candidate's residual if repetition does not give it."""
+    """The first selection, with the noise from the best candidate's residual if neither repetition nor the healthy arm
+    gives it: the limits of the healthy arm hold with its own noise."""
     bench = task.bench(task.arm, task.reference, fit_compliance=task.reference is None)
     selection = task.select(bench)
-    if bench.repeatable or selection.claims:
+    known = bench.repeatable or (task.reference is not None and bool(task.reference.correlated))
+    if known or selection.claims:
         return State(bench, selection)
     best = best_candidate(bench.dictionary, bench.evidence, task.settings)
     quieter = None if best is None else again_with(bench, best, task.settings, task.causes)
