@@ -24,6 +24,7 @@ if TYPE_CHECKING:  # a command imports its own alone
     from ident.estimation.compare import Comparison
     from ident.estimation.payload import PayloadEstimate
     from ident.estimation.validate import Validation
+    from ident.excitation.lower_bound import LowerBound
     from ident.excitation.plan import ExcitationPlan
     from lwr_driver.session.session import SessionSummary
     from runner.preflight import Preflight
@@ -218,12 +219,13 @@ def of_check(found: Mapping[str, Preflight], file: str, files: int) -> Ending:
     return Ending("good", sentence, numbers, next_step=f"lwr-run preview {quote(file)}")
 
 
-def of_plan(found: ExcitationPlan, target: Path) -> Ending:
-    """The end of the planning of a motion, written to `target`."""
+def of_plan(found: ExcitationPlan, target: Path, bound: LowerBound | None) -> Ending:
+    """The end of the planning of a motion, written to `target`; with the bound of its criterion, where it has one."""
     margins = sorted(found.check.margins, key=lambda one: one.share)
     worst = max(found.rsd_percent.items(), key=lambda item: item[1], default=("-", math.nan))
     numbers = [
         *((name, f"{value:.4g}") for name, value in list(found.objectives.items())[:1]),
+        *(() if bound is None else ((bound.criterion, bound.text(found.objectives[bound.criterion])),)),
         *(("tightest", f"{margin}") for margin in margins[:1]),
         ("least certain", f"{worst[0]}, {worst[1]:.1f} % predicted"),
     ]

@@ -1,8 +1,8 @@
 """Planning of exciting motions: parametrisations, criteria, constraints, search, and the resulting plan.
 
-`plan("plans/default.yaml")` does everything. `feasible_fourier` gives a safe motion without
-optimisation, `random_points` the baseline, `trade_off` a front between two criteria, `check_motion` the verdict on any
-motion.
+`plan("plans/default.yaml")` does everything; `lower_bound` tells how far from the best its motion may be.
+`feasible_fourier` gives a safe motion without optimisation, `random_points` the baseline, `trade_off` a front between
+two criteria, `check_motion` the verdict on any motion.
 
 The search runs through `joblib`; its configured backend spreads it over processes or computers. On a Dask cluster, with
 `search.jobs: -1` in the problem file::
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         table_row,
         trade_off,
     )
+    from ident.excitation.lower_bound import LowerBound, can_bound, lower_bound
     from ident.excitation.motions import FourierBasis, FourierSeries, PointToPoint, SplineBasis, SplineMotion
     from ident.excitation.plan import ExcitationPlan, plan_pieces
     from ident.excitation.planner import Progress, feasible_fourier, plan
@@ -50,6 +51,7 @@ __all__ = [
     "FourierSeries",
     "Knowledge",
     "Limits",
+    "LowerBound",
     "Margin",
     "Mechanism",
     "MotionForm",
@@ -66,9 +68,11 @@ __all__ = [
     "Workspace",
     "arm_limits",
     "assemble",
+    "can_bound",
     "check_motion",
     "feasible_fourier",
     "hypervolume",
+    "lower_bound",
     "not_dominated",
     "plan",
     "plan_pieces",
@@ -104,6 +108,11 @@ _HOMES = {
         "table",
         "table_row",
         "trade_off",
+    ),
+    ".lower_bound": (
+        "LowerBound",
+        "can_bound",
+        "lower_bound",
     ),
     ".motions": (
         "FourierBasis",

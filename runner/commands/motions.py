@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -31,12 +32,14 @@ def plan_command(file: str, out: Path | None, as_json: bool) -> None:
 
     The plan file has coefficients, margins of all limits on the continuous motion, objective values, predicted
     relative standard deviations, seeds and versions. An experiment uses it through `excitation: {plan: FILE}`.
-    Ctrl-C ends the search and keeps the best motion so far.
+    Ctrl-C ends the search and keeps the best motion so far. At last a bound that no motion within the limits can fall
+    below tells how far from the best this one may be.
 
     \b
     lwr-run plan
     lwr-run plan my_arm.yaml --out my_arm.plan.yaml
     """
+    from ident.excitation.lower_bound import can_bound, lower_bound
     from ident.excitation.planner import plan
     from ident.excitation.problem import PlanProblem
     from runner.ending import of_plan
@@ -46,8 +49,12 @@ def plan_command(file: str, out: Path | None, as_json: bool) -> None:
     target = out if out is not None else default_output(Path(f"{problem.name}.plan.yaml"), forced())
     progress = StatusLine()
     found = plan(problem, lambda now: show_search(progress, now))
-    progress.clear()
     found.save(target)
+    bounded = can_bound(problem.objective) and not found.provenance["interrupted"]
+    if bounded:
+        progress.show("lower bound of the criterion")
+    bound = lower_bound(problem) if bounded else None
+    progress.clear()
     if as_json:
         keys = ("constraint", "subject", "value", "limit")
         content = {
@@ -55,10 +62,11 @@ def plan_command(file: str, out: Path | None, as_json: bool) -> None:
             "rsd_percent": dict(found.rsd_percent),
             "margins": [{key: getattr(margin, key) for key in keys} for margin in found.check.margins],
             "provenance": dict(found.provenance),
+            "lower_bound": None if bound is None else asdict(bound),
         }
         click.echo(to_json(content))
     else:
-        of_plan(found, target).tell()
+        of_plan(found, target, bound).tell()
 
 
 @verb("check")
