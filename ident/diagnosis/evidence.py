@@ -287,10 +287,14 @@ class Evidence:
         """Whether the prior is the arm's drawing, and not a healthy arm or the bounds of its friction alone."""
         return self.prior is not None and not self.compared and self.nominal.structure.chain.urdf is not None
 
-    def _fit(self, gram: Floats, target: Floats, *, with_prior: bool = True) -> Fit:
-        """Values from sums of products, `with_prior` if there is one."""
+    def _fit(
+        self, gram: Floats, target: Floats, *, with_prior: bool = True, pulls: Floats | None = None
+    ) -> Fit:
+        """Values from sums of products, `with_prior` if there is one; pulls : (P,) precision of columns around zero."""
         s = self._scale
         gram, target = gram.copy(), target.copy()
+        if pulls is not None:
+            gram[np.diag_indices_from(gram)] += pulls
         if self.prior is not None and with_prior:
             p = self.base_count
             gram[:p, :p] += self.prior[0]
@@ -519,11 +523,22 @@ class Evidence:
         sandwich = moved.T @ moved
         return _widened(sandwich, fit.inverse)
 
-    def free(self) -> tuple[Floats, Floats]:
-        """Base parameters (p,) by these sessions alone, without the prior, and their covariance (p, p)."""
-        fit = self._fit(self._part_gram.sum(axis=0), self._part_target.sum(axis=0), with_prior=False)
+    def free(self, around_zero: Sequence[Rows] = (), std: float = 0.0) -> tuple[Floats, Floats]:
+        """Base parameters (p,) by these sessions alone, without the prior, and their covariance (p, p).
+
+        around_zero : groups of the present columns whose coefficients have the mean zero and the standard deviation
+        `std`.
+        """
+        pulls = np.zeros(len(self._scale))
+        known = {id(rows) for rows in around_zero}
+        for place, rows in self._places():
+            if id(rows) in known:
+                pulls[place] = std**-2.0
+        gram, target = self._part_gram.sum(axis=0), self._part_target.sum(axis=0)
+        fit = self._fit(gram, target, with_prior=False, pulls=pulls)
         p = self.base_count
-        return fit.values[:p], self.covariance(fit)[:p, :p]
+        uncertain = (fit.inverse * pulls) @ fit.inverse
+        return fit.values[:p], (self.covariance(fit) + uncertain)[:p, :p]
 
     @property
     def chi_square(self) -> float:

@@ -5,8 +5,9 @@ shows in the parameters themselves: estimated by these sessions alone, beside al
 healthy ones is compared with both uncertainties and with the arm's changes from day to day (`reference.habit`), joint
 by joint (Hotelling's T^2). What a claim on the same torque moves in these parameters is no evidence, for its law and
 theirs share the friction between them; nor is a change beside a larger remainder without a name: what leaves the
-remainder bends the parameters, too. Friction at another level in all sessions may be worn or warmer; the
-same motion cold and warm decides.
+remainder bends the parameters, too. The sensors' gains differ from day to day, and a relative error of a joint's two
+channels looks like friction and inertia: these gains are estimated beside, around zero. Friction at another level in
+all sessions may be worn or warmer; the same motion cold and warm decides.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from ident.diagnosis.held_out import HeldOut
 from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
 from ident.diagnosis.result import Evident, Finding, Value
-from ident.diagnosis.selection import Claim
+from ident.diagnosis.selection import Claim, gain_rows
 from ident.effects import FRICTION_TEMPERATURE, WEAR
 from ident.effects.course import Course
 from ident.estimators.estimate import fisher_tail
@@ -64,8 +65,14 @@ def wear(
     known = np.flatnonzero(np.diag(precision) > 0.0)
     spread = np.zeros_like(precision)
     spread[np.ix_(known, known)] = np.linalg.inv(precision[np.ix_(known, known)])
-    evidence.replace([*claimed, *tolerated])
-    values, covariance = evidence.free()
+    gains = list(gain_rows(bench.dictionary).values())
+
+    def alone(beside: Sequence[Rows]) -> tuple[Floats, Floats]:
+        """Parameters by these sessions beside some claims, and their covariance."""
+        evidence.replace([*beside, *tolerated, *gains])
+        return evidence.free(gains, reference.gain_std)
+
+    values, covariance = alone(claimed)
     # Motor torques sampled at another phase of the commands show another inertia.
     other = ("Ia",) if nominal.arm.motor_delay_s != reference.motor_delay_s else ()
     found = []
@@ -81,8 +88,7 @@ def wear(
         own = covariance[np.ix_(places, places)] + spread[np.ix_(places, places)]
         others = [rows for rows in claimed if ("motor", joint) not in rows]
         if len(others) < len(claimed):
-            evidence.replace([*others, *tolerated])
-            moved = values[places] - evidence.free()[0][places]
+            moved = values[places] - alone(others)[0][places]
             own = own + np.outer(moved, moved)
         if nominal.slow_motor_samples:
             # The phase of slow samples differs from day to day, evenly.

@@ -15,6 +15,7 @@ from typing import ClassVar, Literal
 import clarabel
 import numpy as np
 from scipy import sparse
+from scipy.linalg import solve_triangular
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.base_set import BaseSet
@@ -174,50 +175,113 @@ class PhysicallyConsistent:
 
     def solve(self, scale: float, quadratic: Floats, target: Floats) -> Floats:
         """Standard parameters (n,) for ||quadratic x - target||^2 plus the distance to the prior over `scale`."""
-        prior, n, tightness = self.prior, quadratic.shape[1], 1.0 / scale
-        start = np.zeros(n)
-        start[prior.bodies.ravel()] = prior.inertial.ravel()
-        hessian = 2.0 * quadratic.T @ quadratic
-        gradient = -2.0 * quadratic.T @ target
-        entropic = self.metric == "entropic"
-        extra = len(prior.bodies) * (_BODY + 4) if entropic else 0
-        if not entropic:
-            form = 2.0 * tightness * prior.hessian(self.metric)
-            hessian += form
-            gradient -= form @ start
-        parts, offsets, cones = [], [], []
+        if self.metric == "entropic":
+            return self._entropic(scale, quadratic, target)
+        prior = self.prior
+        root = np.zeros((prior.bodies.size, quadratic.shape[1]))
+        hessian = prior.hessian(self.metric)
+        for number, places in enumerate(prior.bodies):
+            here = slice(number * _BODY, (number + 1) * _BODY)
+            root[here, places] = np.linalg.cholesky(hessian[np.ix_(places, places)] / scale).T
+        matrix = np.vstack([quadratic, root])
+        used = np.ones(quadratic.shape[1], dtype=bool)
+        used[prior.absent] = False
+        size = np.linalg.norm(matrix, axis=0)
+        size = np.where(size > 0.0, size, 1.0)[used]
+        # A trace of curvature makes the solution unique for parameters without effect and prior.
+        stacked = np.vstack([matrix[:, used] / size, 1e-10 * np.eye(len(size))])
+        wanted = np.concatenate([target, root @ self._start, np.zeros(len(size))])
+        q, r = np.linalg.qr(stacked)
+        # Deviations from the minimiser, in units in which they cost the same: there the solver's digits suffice.
+        spread = np.zeros((quadratic.shape[1], len(size)))
+        spread[used] = solve_triangular(r, np.eye(len(size))) / size[:, None]
+        best = np.asarray(spread @ (q.T @ wanted))
+        if self._feasible(best):
+            return best
+        rows, offset, cones = self._constraints()
+        moved = _conic(
+            sparse.eye(len(size), format="csc"),
+            np.zeros(len(size)),
+            rows @ spread,
+            offset - rows @ best,
+            cones,
+        )
+        return best + spread @ moved
+
+    @property
+    def _start(self) -> Floats:
+        """The prior's standard parameters (n,)."""
+        start = np.zeros(self.prior.projection.shape[1])
+        start[self.prior.bodies.ravel()] = self.prior.inertial.ravel()
+        return start
+
+    def _feasible(self, standard: Floats) -> bool:
+        """Whether standard parameters (n,) keep all constraints."""
+        prior = self.prior
+        bodies = zip(prior.bodies, prior.inertial, strict=True)
+        return bool(np.all(standard[prior.nonnegative] >= 0.0)) and all(
+            np.linalg.eigvalsh(
+                pseudo_inertia(standard[places]) - self.margin * _smallest(pseudo_inertia(body))
+            )[0]
+            >= 0.0
+            for places, body in bodies
+        )
+
+    def _constraints(self) -> tuple[Floats, Floats, list]:
+        """Rows of A x + s = b: parameters without negative values, and each body's pseudo-inertia above its floor, as
+        seen from the prior's own, where all bodies are of one size."""
+        prior, n = self.prior, self.prior.projection.shape[1]
         sign = np.zeros((len(prior.nonnegative), n))
         sign[np.arange(len(prior.nonnegative)), prior.nonnegative] = -1.0
-        zero = np.zeros((len(prior.absent), n))
+        parts, offsets, cones = (
+            [sign],
+            [np.zeros(len(sign))],
+            [clarabel.NonnegativeConeT(len(sign))] if len(sign) else [],
+        )
+        basis = pseudo_inertia(np.eye(_BODY))
+        for places, body in zip(prior.bodies, prior.inertial, strict=True):
+            matrix = pseudo_inertia(body)
+            inverse = np.linalg.inv(np.linalg.cholesky(matrix))
+            rows = np.zeros((_BODY, n))
+            rows[:, places] = -_svec(inverse @ basis @ inverse.T).T
+            parts.append(rows)
+            offsets.append(-_svec(inverse @ (self.margin * _smallest(matrix)) @ inverse.T))
+            cones.append(clarabel.PSDTriangleConeT(4))
+        return np.vstack(parts), np.concatenate(offsets), cones
+
+    def _entropic(self, scale: float, quadratic: Floats, target: Floats) -> Floats:
+        """`solve` with the divergence -log det(J J0^-1) + tr(J0^-1 J) - 4 of each body."""
+        prior, n, tightness = self.prior, quadratic.shape[1], 1.0 / scale
+        extra = len(prior.bodies) * (_BODY + 4)
+        hessian = 2.0 * quadratic.T @ quadratic
+        linear = np.concatenate([-2.0 * quadratic.T @ target, np.zeros(extra)])
+        parts, offsets, cones = [], [], []
+        sign = np.zeros((len(prior.nonnegative), n + extra))
+        sign[np.arange(len(prior.nonnegative)), prior.nonnegative] = -1.0
+        zero = np.zeros((len(prior.absent), n + extra))
         zero[np.arange(len(prior.absent)), prior.absent] = 1.0
         for rows, cone in (
             (zero, clarabel.ZeroConeT(len(zero))),
             (sign, clarabel.NonnegativeConeT(len(sign))),
         ):
             if len(rows):
-                parts.append(np.hstack([rows, np.zeros((len(rows), extra))]))
+                parts.append(rows)
                 offsets.append(np.zeros(len(rows)))
                 cones.append(cone)
-        linear = np.concatenate([gradient, np.zeros(extra)])
         for number, (places, body) in enumerate(zip(prior.bodies, prior.inertial, strict=True)):
             matrix = pseudo_inertia(body)
-            if entropic:
-                first = n + number * (_BODY + 4)
-                rows, offset, kinds = _entropic_rows(places, n + extra, first)
-                # Divergence -log det(J J0^-1) + tr(J0^-1 J) - 4; to second order the pullback metric.
-                slope = np.einsum("ab,kba->k", np.linalg.inv(matrix), pseudo_inertia(np.eye(_BODY)))
-                strength = tightness * prior.firmness[number]
-                linear[places] += strength * slope
-                linear[first + _BODY : first + _BODY + 4] -= strength
-            else:
-                floor = self.margin * _smallest(matrix)
-                rows, offset, kinds = _psd_rows(places, n + extra, floor)
+            first = n + number * (_BODY + 4)
+            rows, offset, kinds = _entropic_rows(places, n + extra, first)
+            # To second order the divergence is the pullback metric.
+            slope = np.einsum("ab,kba->k", np.linalg.inv(matrix), pseudo_inertia(np.eye(_BODY)))
+            strength = tightness * prior.firmness[number]
+            linear[places] += strength * slope
+            linear[first + _BODY : first + _BODY + 4] -= strength
             parts.append(rows)
             offsets.append(offset)
             cones += kinds
         full = np.zeros((n + extra, n + extra))
         full[:n, :n] = hessian
-        # A trace of curvature makes the solution unique for parameters without effect and prior.
         full[np.arange(n), np.arange(n)] += 1e-12 * max(float(np.diag(hessian).max()), 1e-12)
         solution = _run(
             sparse.csc_matrix(np.triu(full)), linear, np.vstack(parts), np.concatenate(offsets), cones
@@ -253,26 +317,26 @@ def _run(quadratic: sparse.csc_matrix, linear: Floats, rows: Floats, offset: Flo
     scale = 1.0 / np.where(diagonal > 1e-6 * typical, diagonal, typical)
     objective = float(np.max(np.abs(linear * scale), initial=1e-300))
     spread = sparse.diags(scale)
+    curvature = sparse.csc_matrix(spread @ quadratic @ spread / objective)
+    return scale * _conic(curvature, linear * scale / objective, rows * scale, offset, cones)
+
+
+def _conic(curvature: sparse.csc_matrix, linear: Floats, rows: Floats, offset: Floats, cones: list) -> Floats:
+    """The least x^T curvature x / 2 + linear^T x with offset - rows x in the cones."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = 1e-10
     settings.tol_feas = 1e-10
-    solver = clarabel.DefaultSolver(
-        sparse.csc_matrix(spread @ quadratic @ spread / objective),
-        linear * scale / objective,
-        sparse.csc_matrix(rows * scale),
-        offset,
-        cones,
-        settings,
-    )
-    result = solver.solve()
+    result = clarabel.DefaultSolver(
+        curvature, linear, sparse.csc_matrix(rows), offset, cones, settings
+    ).solve()
     status = str(result.status)
     if status not in ("Solved", "AlmostSolved"):
         raise DataError(
             f"the physically consistent program ended with {status}; check the prior's masses and the "
             "parameters' units, or raise `strength`"
         )
-    return scale * np.array(result.x)
+    return np.array(result.x)
 
 
 def _svec(matrix: Floats) -> Floats:
