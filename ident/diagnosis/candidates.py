@@ -186,12 +186,13 @@ class Dictionary:
             for joint in ([-1] if EFFECTS[cause].whole_arm else np.flatnonzero(nominal.moving).tolist())
         )
         self._kept: dict[tuple[str, int], list[_Entry]] = {}
+        self._information: dict[tuple[str, int], dict[str, float]] = {}
         self._arena = Arena()
 
     def of(self, causes: Sequence[str] | None) -> Dictionary:
         """The same with fewer causes, and the columns made so far."""
         found = Dictionary(self.nominal, self.evidence, causes)
-        found._kept, found._arena = self._kept, self._arena
+        found._kept, found._information, found._arena = self._kept, self._information, self._arena
         return found
 
     def rows(self, candidate: Candidate, shape: Shape) -> Rows:
@@ -304,6 +305,28 @@ class Dictionary:
             if better and candidate.effect.plausible(score.coefficients, shape):
                 best = Trial(candidate, shape, score, rows)
         return best
+
+    def information(self, candidate: Candidate) -> dict[str, float]:
+        """How much these motions show of a candidate, by shape of its grid: the mean fall of the chi-square for a unit
+        of its coefficients, beside the base alone. Empty for events, which are anywhere."""
+        if candidate.key not in self._information:
+            effect = candidate.effect
+            entries = [] if effect.repeats or effect.step or effect.event else self._prepared(candidate)
+            self._information[candidate.key] = {
+                repr(shape): self.evidence.information(known) for shape, _, known in entries
+            }
+        return self._information[candidate.key]
+
+    def nearest(self, trial: Trial) -> str:
+        """The shape of the grid nearest to a trial's, empty without one."""
+        shapes = [shape for shape, *_ in self._kept.get(trial.candidate.key, ())]
+        alike = [shape for shape in shapes if shape.form == trial.shape.form]
+
+        def distance(shape: Shape) -> float:
+            pairs = ((shape[name], value) for name, value in trial.shape.items() if name in shape)
+            return sum(abs(a - b) / max(abs(a) + abs(b), 1e-12) for a, b in pairs)
+
+        return repr(min(alike, key=distance)) if alike else ""
 
     def measure(
         self, candidate: Candidate, rows: Rows, choices: int = 1, known: Products | None = None

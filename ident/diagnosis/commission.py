@@ -249,6 +249,7 @@ def commission(
     known = replace(known, healthy=character(known, recorded, settings))
     days = [_day(known, recordings, settings, base) for recordings in recorded]
     null: dict[tuple[str, int], float] = {}
+    shown: dict[tuple[str, int], dict[str, float]] = {}
     for number, recordings in enumerate(recorded):
         others = [day for k, day in enumerate(days) if k != number]
         rest = _reference(others, known, robot, parts[0], {}, days) if others else None
@@ -256,12 +257,17 @@ def commission(
         own = gains(bench.dictionary, bench.evidence, settings)
         for key, gain in (own | remainder_gains(bench.dictionary, bench.evidence)).items():
             null[key] = null.get(key, 0.0) + gain / len(parts)
+        for candidate in bench.dictionary.candidates:
+            mean = shown.setdefault(candidate.key, {})
+            for shape, value in bench.dictionary.information(candidate).items():
+                mean[shape] = mean.get(shape, 0.0) + value / len(parts)
         log.info("healthy set %d of %d", number + 1, len(parts))
     found = _reference(days, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
     provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals)}
     return replace(
         found,
         model=replace(found.model, provenance=provenance),
+        shown=shown,
         compliance_std=compliance_std([one.compliance for one in several]),
     )
 

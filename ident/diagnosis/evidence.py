@@ -378,6 +378,19 @@ class Evidence:
             _add_products(wide, self._targets[key], starts, weight, places[:1], target)
         return Products(base, own, target[:, :, 0], self.parts)
 
+    def information(self, products: Products) -> float:
+        """Mean fall of the chi-square for a unit of a group's coefficients beside the base parameters alone."""
+        cross, own = products.alone.sum(axis=0), products.own.sum(axis=0)
+        p = self.base_count
+        gram = self._base_gram.sum(axis=0)
+        if self.prior is not None:
+            gram = gram + self.prior[0]
+        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        inner = gram / np.outer(scale, scale) + 1e-9 * np.eye(p)
+        wide = cross / scale
+        left = np.diag(own) - np.einsum("kp,pk->k", wide, np.linalg.solve(inner, wide.T))
+        return float(np.mean(np.maximum(left, 0.0)))
+
     # ---- scores ----
 
     def score(

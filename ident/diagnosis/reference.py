@@ -87,6 +87,7 @@ class Reference:
     gain_std: float = GAIN_STD
     compliance_std: Floats | None = None
     correlated: Mapping[str, Floats] = field(default_factory=dict)
+    shown: Mapping[tuple[str, int], Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def unknown_stiffness(self) -> tuple[str, ...]:
@@ -126,6 +127,10 @@ class Reference:
             return cls(model, np.zeros(0), 0.0, 0.0, {}, {}, 0)
         try:
             null = {_split(key): float(value) for key, value in stored["null"].items()}
+            shown = {
+                _split(key): {shape: float(v) for shape, v in some.items()}
+                for key, some in stored.get("shown", {}).items()
+            }
             compliance = np.array(stored["compliance"], dtype=np.float64)
             noise = {side: np.array(v, dtype=np.float64) for side, v in stored["noise"].items()}
             correlated = {side: np.array(v, dtype=float) for side, v in stored.get("correlated", {}).items()}
@@ -163,6 +168,7 @@ class Reference:
             float(stored.get("gain_std", GAIN_STD)),
             compliance_std,
             correlated,
+            shown,
         )
 
     def stored(self) -> dict[str, Any]:
@@ -178,6 +184,10 @@ class Reference:
                 "correlated": {side: _listed(values) for side, values in self.correlated.items()},
                 "null": {
                     f"{cause} {joint + 1}": round(float(v), 2) for (cause, joint), v in self.null.items()
+                },
+                "shown": {
+                    f"{cause} {joint + 1}": {shape: float(f"{v:.4g}") for shape, v in some.items()}
+                    for (cause, joint), some in self.shown.items()
                 },
                 "sets": self.sets,
                 "habits": self.habits,

@@ -51,11 +51,16 @@ _EITHER = 0.5
 # Latest sets of columns whose best shapes are kept.
 _LATEST = 6
 
+# Least and largest ratio of the information to that of the healthy sets.
+_INFORMATION = (0.25, 25.0)
+
 GAIN = "gain"
 """Name of the tolerated deviation of a torque sensor's gain, before the number of its joint."""
 
 Null = Mapping[tuple[str, int], float]
 """Upper limit of each candidate's gain in a healthy set."""
+Shown = Mapping[tuple[str, int], Mapping[str, float]]
+"""Mean information of the healthy sets on each candidate, by shape of its grid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +93,14 @@ class Selection:
 
 
 def select(
-    dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings, null: Null | None = None
+    dictionary: Dictionary,
+    evidence: Evidence,
+    settings: DiagnosisSettings,
+    null: Null | None = None,
+    shown: Shown | None = None,
 ) -> Selection:
     """Accept causes one after the other as long as the evidence suffices."""
-    state = State(dictionary, evidence, settings, null or {})
+    state = State(dictionary, evidence, settings, null or {}, shown or {})
     state.tolerate([])
     first: dict[tuple[str, int], float] = {}
     accepted: list[Trial] = []
@@ -198,6 +207,7 @@ class State:
     evidence: Evidence
     settings: DiagnosisSettings
     null: Null
+    shown: Shown = field(default_factory=dict)
     nuisance: dict[str, tuple[float, float]] = field(default_factory=dict)
     nuisance_rows: list[Rows] = field(default_factory=list)
     _tolerances: list[_Tolerance] | None = None
@@ -317,7 +327,7 @@ class State:
 
     def rivals(self) -> list[Trial]:
         """The simplest candidates by their gain, best first. A gain as on the healthy arm explains nothing."""
-        found = [t for t in self.simplest() if _gain(t) > self.null.get(t.candidate.key, 0.0)]
+        found = [t for t in self.simplest() if _gain(t) > self.usual(t)]
         return sorted(found, key=_gain, reverse=True)
 
     def next(self, accepted: Sequence[Trial], carried: list[Trial]) -> Trial | None:
@@ -333,6 +343,15 @@ class State:
             self.tolerate(accepted)
             carried = [t for t in carried if t.candidate.key != best.candidate.key]
         return None
+
+    def usual(self, trial: Trial) -> float:
+        """Upper limit of the gain of such a trial on a healthy arm, in sessions with as much information on it."""
+        key = trial.candidate.key
+        limit = self.null.get(key, 0.0)
+        shape = self.dictionary.nearest(trial)
+        before = self.shown.get(key, {}).get(shape, 0.0)
+        now = self.dictionary.information(trial.candidate).get(shape, 0.0)
+        return limit * float(np.clip(now / before, *_INFORMATION)) if before > 0.0 else limit
 
     def refined(self, trial: Trial) -> Trial:
         """The trial with its shape at the best fit, unless cross-validation contradicts that shape."""
@@ -364,7 +383,7 @@ class State:
         settings = self.settings
         strict = trial.candidate.effect.evidence_factor
         least = strict * (settings.least_gain + 6.0 * (len(score.coefficients) - 1))
-        least = max(least, self.null.get(trial.candidate.key, 0.0))
+        least = max(least, self.usual(trial))
         if trial.candidate.effect.seen_in_samples(trial.shape):
             return score.gain > least
         if score.gain <= least or score.p_value >= settings.alpha_rare:

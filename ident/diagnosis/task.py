@@ -59,7 +59,13 @@ class Task:
 
     def select(self, bench: DiagnosisBench) -> Selection:
         """The causes supported by the data of a bench."""
-        return select(bench.dictionary, bench.evidence, self.settings, self.null)
+        return select(
+            bench.dictionary,
+            bench.evidence,
+            self.settings,
+            self.null,
+            None if self.reference is None else self.reference.shown,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -225,7 +225,9 @@ def choose(
         entry_of(SENSOR_GAIN, [chain.joint_names.index(joint) + 1], {"error": gain})
         for joint, gain in choice.gains.items()
     )
-    return replace(found, settings=settled, choice=choice, effects=effects)
+    apart = choice.disagreement
+    warnings = (*found.warnings, str(apart)) if apart is not None and apart.strong else found.warnings
+    return replace(found, settings=settled, choice=choice, effects=effects, warnings=warnings)
 
 
 def _calibrated(session: Session, gains: Mapping[str, tuple[float, float]]) -> Session:

@@ -27,6 +27,11 @@ from ident.estimators.problem import Problem
 
 # The data say nothing of a parameter while this share of its prior standard deviation is left.
 _UNSEEN = 0.9
+# Least common factor between data and prior worth a warning, and its standard deviations: masses of a URDF are off by
+# up to a third.
+_FACTOR, _FACTOR_DEVIATIONS = 0.2, 4.0
+# Mean distance of data and prior, and largest probability of it, of which a prior is of another arm.
+_FAR, _CHANCE = 3.0, 1e-6
 
 
 @dataclass(frozen=True)
@@ -114,12 +119,15 @@ class Disagreement:
 
     chi_square, freedom : over the independent combinations of parameters that the data know better than the prior.
     names, deviations : parameters that the data know better than the prior, the farthest from it first.
+    factor, factor_std : of the data over the prior, one for all parameters, and its standard deviation by both.
     """
 
     chi_square: float
     freedom: int
     names: tuple[str, ...]
     deviations: tuple[float, ...]
+    factor: float = 1.0
+    factor_std: float = np.inf
 
     @property
     def p_value(self) -> float:
@@ -131,7 +139,8 @@ class Disagreement:
         """Of the rows with a weight for each class, the parameters without prior left free.
 
         With S the information of the rows and L the prior's, the rows' score at the prior's mean has the
-        covariance S L^-1 S + S if the prior holds; the eigenvectors of S relative to L make it diagonal.
+        covariance S L^-1 S + S if the prior holds; the eigenvectors of S relative to L make it diagonal. With all
+        parameters 1 + d times the prior's mean m its mean is d S m.
         """
         known = np.flatnonzero(np.diag(prior.precision) > 0.0)
         free = np.flatnonzero(np.diag(prior.precision) == 0.0)
@@ -149,7 +158,11 @@ class Disagreement:
         root = np.linalg.cholesky(np.linalg.inv(precision))
         gain, vectors = np.linalg.eigh(root.T @ information @ root)
         told = gain > 1.0
-        z = (vectors.T @ root.T @ score)[told] / np.sqrt(gain[told] ** 2 + gain[told])
+        spread = np.sqrt(gain[told] ** 2 + gain[told])
+        z = (vectors.T @ root.T @ score)[told] / spread
+        slope = (vectors.T @ root.T @ information @ (prior.mean[known] * size))[told] / spread
+        power = float(slope @ slope)
+        common = (1.0 + float(slope @ z) / power, power**-0.5) if power > 0.0 else (1.0, np.inf)
         alone = np.linalg.inv(information + 1e-6 * precision)
         std = np.sqrt(np.diag(alone))
         before = np.sqrt(np.diag(root @ root.T))
@@ -160,7 +173,19 @@ class Disagreement:
             int(told.sum()),
             tuple(problem.names[known[k]] for k in order),
             tuple(float(single[k]) for k in order),
+            *common,
         )
+
+    @property
+    def scaled(self) -> bool:
+        """Whether all parameters are off by a factor that is no chance."""
+        off = abs(self.factor - 1.0)
+        return off > max(_FACTOR, _FACTOR_DEVIATIONS * self.factor_std)
+
+    @property
+    def strong(self) -> bool:
+        """Whether prior and data can hardly be of one arm."""
+        return self.scaled or (self.p_value < _CHANCE and self.chi_square > _FAR**2 * self.freedom)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content for files."""
@@ -169,6 +194,8 @@ class Disagreement:
             "freedom": self.freedom,
             "p_value": self.p_value,
             "deviations": dict(zip(self.names, self.deviations, strict=True)),
+            "factor": self.factor,
+            "factor_std": self.factor_std if np.isfinite(self.factor_std) else None,
         }
 
     def __str__(self) -> str:
@@ -183,11 +210,17 @@ class Disagreement:
             if worst
             else "in combinations of parameters, for no single one is known better than from the URDF"
         )
+        if self.scaled:
+            return (
+                f"the data are {self.factor:.2f} ± {self.factor_std:.2f} times what the URDF's inertials predict, in "
+                "all bodies alike: check unit, gear ratio and torque constants, or the masses of the URDF"
+            )
         if self.p_value > 0.01:
             return f"the URDF's inertials and the data agree (distance {ratio:.2f} standard deviations)"
         return (
-            f"the URDF's inertials and the data disagree: {ratio:.1f} standard deviations on average, {single}; check "
-            "masses and tool of the URDF, or use looser deviations (`estimator.prior_std`)"
+            f"the URDF's inertials and the data disagree: {ratio:.1f} standard deviations on average, {single}; "
+            "check masses and tool of the URDF and whether it is of this arm, or use looser deviations "
+            "(`estimator.prior_std`)"
         )
 
 

@@ -1,9 +1,9 @@
 """Which single change of a channel makes the data of an arm agree with themselves.
 
 Each explanation is a common mistake of people and programs: the sign of a channel, its unit or gain, two
-interchanged joints, a zero offset, the pace of time, the label of a payload. It is undone in the rows of `Redundancy`
-and judged by the fall of the score, the sum over joints and sides of log(residual / torque). The best one is taken, and
-the search goes on in the mended data, because two channels may be wrong.
+interchanged joints, a zero offset, the pace of time, the label of a payload, an arm on a wall. It is undone in the rows
+of `Redundancy` and judged by the fall of the score, the sum over joints and sides of log(residual / torque). The best
+one is taken, and the search goes on in the mended data, because two channels may be wrong.
 """
 
 from __future__ import annotations
@@ -124,6 +124,7 @@ def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanat
 
 
 def _motions(data: Redundancy) -> Iterator[Explanation]:
+    yield from _mountings(data)
     yield from _positions(data)
     yield from (_paced(data, factor) for factor in _PACES)
     yield from _labels(data)
@@ -195,6 +196,21 @@ def _positions(data: Redundancy) -> Iterator[Explanation]:
             yield Explanation("position", (joint,), looks, moved(data, np.eye(n), offset))
     for factor in (-1.0, 180.0 / np.pi, np.pi / 180.0):
         yield _position_gain(data, tuple(range(n)), factor)
+
+
+def _mountings(data: Redundancy) -> Iterator[Explanation]:
+    """Gravity along any axis of the base: an arm on a wall or under a ceiling."""
+    size = float(np.linalg.norm(data.chain.gravity))
+    for axis in np.vstack([np.eye(3), -np.eye(3)]) if size else ():
+        along = data.chain.base_placement[:3, :3].T @ axis
+        if along @ data.chain.gravity > 0.9 * size:
+            continue
+        looks = (
+            f"gravity along {axis.astype(int).tolist()} in the axes of the URDF's root: a wall or a ceiling"
+        )
+        yield Explanation(
+            "mounting", (), looks, replace(data, chain=replace(data.chain, gravity=size * along))
+        )
 
 
 def _position_gain(data: Redundancy, joints: tuple[int, ...], factor: float) -> Explanation:

@@ -228,6 +228,9 @@ def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
         stated = payload_name(sessions[int(one.label)]) or "none"
         seen = f"the torques contradict the label {stated!r}; {better}"
         mend = f"name the mounted payload (`--payload {session}=NAME`, `none`: the bare arm)"
+    elif channel == "mounting":
+        seen = f"the torques contradict gravity down the URDF's z axis; {better}"
+        mend = "add a root link with its z axis up to the URDF, and a fixed joint from it to the base"
     elif channel == "time":
         seen = f"accelerations and gravity contradict each other; {better}"
         mend = "check the sampling rate and the unit of time of the log"

@@ -22,6 +22,8 @@ _LATE_LOOK = 1e-3
 _SLOWEST_S = 2e-3
 _MOVING_LIMIT = 0.05
 _LISTED = 2
+# Torque error of a model that predicts zero.
+_NOTHING = 1.0
 _WITHIN_3_SIGMA = 0.99
 """Least share within 3 standard deviations; nominal for a normal error: 99.7 %."""
 
@@ -47,7 +49,7 @@ class Verdict:
 def verdicts(results: ResultFolder) -> list[Verdict]:
     """The verdicts on a folder, in the order of importance."""
     found = (question(results) for question in _QUESTIONS)
-    return [verdict for verdict in found if verdict is not None]
+    return [*(verdict for verdict in found if verdict is not None), *_warnings(results)]
 
 
 def headline(lines: list[Verdict]) -> tuple[Level, str]:
@@ -146,7 +148,9 @@ def _torque_error(subject: str, unseen: bool, results: ResultFolder) -> Verdict 
         )
         shown_limits = limits if len(mine) <= _LISTED else [limits[0]]
         wanted.append(f"{side} {', '.join(dict.fromkeys(f'{100 * limit:.1f} %' for limit in shown_limits))}")
-        if not all(one.relative <= limit for one, limit in sought.items()):
+        if any(one.relative >= _NOTHING for one in sought):
+            level = "bad"
+        elif not all(one.relative <= limit for one, limit in sought.items()) and level == "good":
             level = "look"
     return Verdict(subject, ". ".join(map(_capital, parts)), f"below {'; '.join(wanted)}", level, "torque")
 
@@ -187,6 +191,12 @@ def _assumptions(results: ResultFolder) -> Verdict | None:
         text += f"; not covered: {_listed(open_ones)}" if open_ones else ""
         violated = open_ones
     return Verdict("assumptions", text, "none uncovered", "look" if violated else "good", "assumptions")
+
+
+def _warnings(results: ResultFolder) -> list[Verdict]:
+    """What the estimate warns of, a line each."""
+    texts = results.summary.get("warnings", ())
+    return [Verdict("warning", text, "", "look", "assumptions") for text in texts]
 
 
 def _essential(results: ResultFolder) -> Verdict | None:
