@@ -398,7 +398,8 @@ class Dictionary:
                 low, high = max(here - 2.5, _STEP_ROOM_S), min(here + 2.5, last)
             elif effect.event:
                 low, high = (here - 0.3, here + 0.3) if name == "time" else (0.4 * here, 2.0 * here)
-            low, high = max(low, limits.low), min(high, limits.high)
+            least = effect.least(self.setting, max(trial.candidate.joint, 0)).get(name, limits.low)
+            low, high = max(low, limits.low, least), min(high, limits.high)
             if low < high:
                 logarithmic = low > 0.0 and not effect.event
                 ends = (float(np.log(low)), float(np.log(high))) if logarithmic else (low, high)
@@ -461,6 +462,7 @@ def _setting(nominal: Nominal, *, compared: bool) -> Setting:
         position_range=np.stack([q.min(axis=0), q.max(axis=0)], axis=1),
         encoder=arm.encoder if arm.encoder_known else None,
         presliding=arm.presliding,
+        standstill_rad_s=nominal.settings.standstill_rad_s,
         compared=compared,
         compliance=arm.compliance if all(m.springs is not None for m in motions) else None,
         clipped=_clipped(nominal),

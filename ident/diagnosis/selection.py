@@ -19,7 +19,8 @@ from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.effects import DELAYS, ELASTICITY, SENSOR_GAIN, Shape
+from ident.effects import DELAYS, ELASTICITY, PRESLIDING, SENSOR_GAIN, Column, Shape
+from ident.effects.motion import ArmMotion
 from ident.estimators.estimate import normal_tail
 
 log = logging.getLogger(__name__)
@@ -36,6 +37,9 @@ _SAME_ROWS = 0.2
 _LAW_ERROR, _MOSTLY = 0.1, 0.8
 # Least time between two separate pushes [s].
 _PAUSE_S = 0.2
+# Habits of the arm that are tolerated: least gain, least share of the best candidate's gain, and number.
+_HABIT = "habit"
+_LEAST_HABIT, _NEAR, _MOST_HABITS = 100.0, 0.5, 4
 # Least gain of `best_candidate`.
 _LEAST_GAIN = 10.0
 # Factor on the tolerance for a whole channel's delay with a known healthy delay.
@@ -51,8 +55,12 @@ _EITHER = 0.5
 # Latest sets of columns whose best shapes are kept.
 _LATEST = 6
 
-# Least and largest ratio of the information to that of the healthy sets.
-_INFORMATION = (0.25, 25.0)
+# Least and largest ratio of the information to that of the healthy sets: less of it makes no limit smaller, for what
+# the model lacks differs from motion to motion, too.
+_INFORMATION = (1.0, 25.0)
+
+# Standard deviation of a presliding length from day to day, as a share of it.
+LENGTH_STD = 0.2
 
 GAIN = "gain"
 """Name of the tolerated deviation of a torque sensor's gain, before the number of its joint."""
@@ -107,6 +115,8 @@ def select(
     for _ in range(settings.rounds):
         found = state.contenders(accepted)
         first = first or {t.candidate.key: max(t.score.gain, 0.0) for t in found}
+        while state.habit(found):
+            found = state.contenders(accepted)
         best = state.next(accepted, [t for t in found if state.carried(t)])
         if best is None:
             break
@@ -132,6 +142,27 @@ def gain_rows(dictionary: Dictionary) -> dict[int, Rows]:
     joints = [j for side, j in mask if side == "joint" and mask[side, j].any()]
     found = {j: dictionary.rows(Candidate(SENSOR_GAIN, j), Shape()) for j in joints}
     return {j: rows for j, rows in found.items() if rows}
+
+
+def presliding_rows(dictionary: Dictionary) -> dict[int, Rows]:
+    """Rows of a change of the drives' presliding length, in shares of it, by joint from 0, where the arm has one."""
+    nominal = dictionary.nominal
+    lengths = nominal.arm.presliding
+    if lengths is None or "motor" not in nominal.rows:
+        return {}
+    found: dict[int, Rows] = {}
+    for joint in np.flatnonzero((lengths > 0.0) & nominal.moving).tolist():
+        near = [
+            Shape(length=float(lengths[joint]) * factor) for factor in (1.0 + LENGTH_STD, 1.0 - LENGTH_STD)
+        ]
+
+        def made(motion: ArmMotion, joint: int = joint, near: Sequence[Shape] = tuple(near)) -> list[Column]:
+            scale = float(motion.motor_coulomb[joint]) / (2.0 * LENGTH_STD)
+            longer, shorter = (np.asarray(PRESLIDING.columns(motion, joint, one)[0].motor) for one in near)
+            return [Column(motor=scale * (longer - shorter))]
+
+        found[joint] = {("motor", joint): nominal.columns(made, ["motor"])["motor"][0][:, None]}
+    return found
 
 
 def gains(
@@ -246,6 +277,10 @@ class State:
                 _Tolerance(f"{GAIN} {j + 1}", rows, 1.0, size, (SENSOR_GAIN.cause, j))
                 for j, rows in gain_rows(self.dictionary).items()
             ]
+            found += [
+                _Tolerance(f"presliding {j + 1}", rows, 1.0, _HABITUAL * LENGTH_STD, (PRESLIDING.cause, j))
+                for j, rows in presliding_rows(self.dictionary).items()
+            ]
         self._tolerances = found
         return found
 
@@ -277,15 +312,16 @@ class State:
         taken = {t.candidate.key for t in accepted}
         entries = [one for one in self.tolerances() if one.of not in taken]
         fixed = [t.rows for t in accepted]
-        self.evidence.replace([*fixed, *(one.rows for one in entries)])
         place = self.evidence.base_count + sum(_width(rows) for rows in fixed)
-        values = self.evidence.full.values[place:]
-        inside = [
-            one for one, value in zip(entries, values, strict=True) if abs(value) * one.unit <= one.size
-        ]
-        if len(inside) < len(entries):
+        inside = entries
+        while True:
             self.evidence.replace([*fixed, *(one.rows for one in inside)])
-        values = self.evidence.full.values[place:]
+            values = self.evidence.full.values[place:]
+            over = [abs(value) * one.unit / one.size for one, value in zip(inside, values, strict=True)]
+            if max(over, default=0.0) <= 1.0:
+                break
+            # Without the farthest one the others may be inside.
+            inside = [one for one, share in zip(inside, over, strict=True) if share < max(over)]
         # A motion without information on a deviation leaves its variance open.
         std = np.sqrt(np.maximum(np.diag(self.evidence.full.inverse), 0.0))[place:]
         self.nuisance = {
@@ -344,6 +380,20 @@ class State:
             carried = [t for t in carried if t.candidate.key != best.candidate.key]
         return None
 
+    def habit(self, found: Sequence[Trial]) -> bool:
+        """Tolerates the best candidate of a gain as on healthy days, near that of the best one of all; whether there is
+        one. A change from day to day that is not in the model would pass for other causes."""
+        known = [one for one in self.tolerances() if one.name.startswith(_HABIT)]
+        near = [t for t in found if t.score.gain > max(_LEAST_HABIT, _NEAR * found[0].score.gain)]
+        for trial in near if len(known) < _MOST_HABITS else ():
+            single = len(trial.score.coefficients) == 1 and not trial.candidate.effect.event
+            if single and not self.carried(trial) and self.carried(trial, healthy=False):
+                log.info("%s: gain %.0f, as on healthy days", trial.candidate.key, trial.score.gain)
+                name = f"{_HABIT} {len(known) + 1}: {trial.candidate.cause} {trial.candidate.joint + 1}"
+                self.tolerances().append(_Tolerance(name, trial.rows, 1.0, np.inf, trial.candidate.key))
+                return True
+        return False
+
     def usual(self, trial: Trial) -> float:
         """Upper limit of the gain of such a trial on a healthy arm, in sessions with as much information on it."""
         key = trial.candidate.key
@@ -377,13 +427,14 @@ class State:
         """Number of shapes in the choice of an event."""
         return self.evidence.blocks if trial.candidate.effect.event else 1
 
-    def carried(self, trial: Trial, score: Score | None = None) -> bool:
-        """Whether the evidence for the trial suffices: gain, significance, and size."""
+    def carried(self, trial: Trial, score: Score | None = None, *, healthy: bool = True) -> bool:
+        """Whether the evidence for the trial suffices: gain, significance, and size. healthy : False asks for no more
+        gain than on healthy days."""
         score = trial.score if score is None else score
         settings = self.settings
         strict = trial.candidate.effect.evidence_factor
         least = strict * (settings.least_gain + 6.0 * (len(score.coefficients) - 1))
-        least = max(least, self.usual(trial))
+        least = max(least, self.usual(trial)) if healthy else least
         if trial.candidate.effect.seen_in_samples(trial.shape):
             return score.gain > least
         if score.gain <= least or score.p_value >= settings.alpha_rare:

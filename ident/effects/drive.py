@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any, ClassVar
 
@@ -67,10 +67,17 @@ class PreslidingHysteresis(Effect):
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """From half a milliradian, or ten times the presliding length of the model, to a tenth of a radian."""
-        # A length near that of the healthy drive is a small change of the latter, not another friction.
-        least = 0.0 if setting.presliding is None else 10.0 * float(setting.presliding[joint])
+        least = self.least(setting, joint).get("length", 0.0)
         lengths = [Shape(length=x) for x in (5e-4, 1.5e-3, 5e-3, 1.5e-2, 5e-2, 0.15) if x >= least]
-        return [*lengths, *(Shape(_Turning.SMOOTH, velocity=v) for v in (0.005, 0.02, 0.06))]
+        return [*lengths, *(Shape(_Turning.SMOOTH, velocity=v) for v in (0.01, 0.025, 0.06))]
+
+    def least(self, setting: Setting, joint: int) -> Mapping[str, float]:
+        """A length near that of the healthy drive is a small change of the latter, not another friction; a film that
+        shows at a standstill alone is that of any drive at rest."""
+        found = {"velocity": setting.standstill_rad_s}
+        if setting.presliding is not None:
+            found["length"] = 10.0 * float(setting.presliding[joint])
+        return found
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Dahl's state, or the hyperbolic tangent of the speed, less sign(v) in the motor torque."""

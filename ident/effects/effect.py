@@ -160,7 +160,8 @@ class Setting:
         largest predicted joint torque [Nm] and motor speed [rad/s]. position_range : (n, 2) [rad]. torque_turns :
         (n,) whether the joint torque changes its sign for more than a moment. encoder : side of the elastic joints
         with the published positions, None if unknown. presliding : (n,) presliding length of the model [rad],
-        None if unknown. compared : whether the sessions are compared with a reference. compliance : (n,) [rad/Nm]
+        None if unknown. standstill_rad_s : rows below this speed are left out. compared : whether the sessions are
+        compared with a reference. compliance : (n,) [rad/Nm]
         of the springs behind published motors, None if the links' positions are published. clipped : (n,) torque
         limit seen in the samples of a joint's sensor [Nm], NaN for none. pauses : whether the sessions follow one
         another by their clock, with pauses.
@@ -175,6 +176,7 @@ class Setting:
     position_range: Floats
     encoder: Literal["link", "motor"] | None = None
     presliding: Floats | None = None
+    standstill_rad_s: float = 0.01
     compared: bool = False
     compliance: Floats | None = None
     clipped: Floats | None = None
@@ -304,6 +306,10 @@ class Effect(ABC):
         return f"{type(self).__name__}({self.cause}, {self.side} side: {self.summary})"
 
     # ---- torque ----
+
+    def least(self, setting: Setting, joint: int) -> Mapping[str, float]:
+        """Least shape parameters: below them it is the healthy arm's own, or in no row; default those of the grid."""
+        return {}
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """Initial shapes of the search; by default a single empty one, for a torque linear in all parameters."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -222,11 +222,12 @@ def _columns(
     chains = tuple(replace(structure.chain, gravity=direction) for direction in directions)
     leaning = _Leaning(structure, chains, found.base.columns, found.estimate.values)
     result = []
-    for session, payload in zip(sessions, found.payloads, strict=True):
+    for session, payload, known in zip(sessions, found.payloads, found.prepared, strict=True):
         chosen = session.select(structure.chain.joint_names)
+        delay_s: float | Literal["estimate"] = "estimate" if known.delay is None else known.delay.seconds
         moving = prepare(
             chosen,
-            settings.signals,
+            replace(settings.signals, motor_delay_s=delay_s),
             resonance_hz=settings.resonance_hz,
             motor=settings.model == 2,
             log=False,

@@ -10,6 +10,8 @@ terms pass the same low-pass. d solves a small nonlinear least-squares problem (
 standard deviation is robust to serial correlation and inflated by the scatter of the joints. An unknown delay biases
 Ia by -Fvm d, so its uncertainty enters the covariance of every estimate.
 
+Without joint torques the base model takes their place (`delay_alone`).
+
 The motors turn ahead of their links by tau_l / k. An error of the stated compliance makes a joint look late by about
 Fvm times that error, another one for each joint, so the joints count with this uncertainty beside their own.
 """
@@ -28,7 +30,7 @@ from fri.errors import DataError
 from ident.dynamics.parameters import Floats
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.least_squares import WeightedLeastSquares
-from ident.estimators.problem import Problem, RowGroup
+from ident.estimators.problem import Nuisance, Problem, RowGroup
 from ident.rows.content import Kept
 from ident.rows.filters import ParallelFilter, half_width, interpolate_uniform, low_pass
 from lwr_driver.session.spool import Growing, release
@@ -189,17 +191,41 @@ def _estimated(
             break
     steps, stds, viscous = _newton(parts, joints, delay, separate=True)
     elastic = 0.0 if compliance is None else _COMPLIANCE_SHARE * np.abs(viscous) * compliance[joints]
-    spread = np.hypot(stds, elastic)
-    weights = spread**-2.0
-    mean = float(np.sum(weights * steps) / np.sum(weights))
-    chi = float(np.sqrt(np.sum(weights * (steps - mean) ** 2) / max(len(steps) - 1, 1)))
+    names = [joint_names[j] for j in joints]
+    return _together(names, delay + steps, np.hypot(stds, elastic), "from the torque difference")
+
+
+def _together(names: Sequence[str], values: Floats, stds: Floats, how: str) -> Delay:
+    """The delay of a channel from those of its joints with standard deviations (J,)."""
+    weights = stds**-2.0
+    mean = float(np.sum(weights * values) / np.sum(weights))
+    chi = float(np.sqrt(np.sum(weights * (values - mean) ** 2) / max(len(values) - 1, 1)))
     disagreement = max(1.0, chi)
-    by_joint = {
-        joint_names[j]: (delay + float(step), float(s))
-        for j, step, s in zip(joints, steps, spread, strict=True)
-    }
-    std = float(np.sum(weights)) ** -0.5
-    return Delay.of(delay + mean, std * disagreement, "from the torque difference", by_joint, disagreement)
+    by_joint = {name: (float(v), float(s)) for name, v, s in zip(names, values, stds, strict=True)}
+    return Delay.of(mean, float(np.sum(weights)) ** -0.5 * disagreement, how, by_joint, disagreement)
+
+
+def delay_alone(problem: Problem, nuisance: Nuisance, before: float = 0.0) -> Delay:
+    """Delay of motor torques without joint torques beside them: of the torque against the base model's motion.
+
+    A torque late by d is tau - d dtau/dt, so a further column -dtau/dt of each joint, beside all base parameters, has
+    the coefficient d. nuisance : with d(target) / d(delay) of the rows of this channel, at the delay `before` [s].
+
+    Raises DataError for rows that do not determine all parameters.
+    """
+    problem.require_rank()
+    joints = list(dict.fromkeys(problem.groups[number].joint for number in nuisance.columns))
+    groups = []
+    for number, group in enumerate(problem.groups):
+        late = np.zeros((len(group.target), len(joints)))
+        if number in nuisance.columns:
+            late[:, joints.index(group.joint)] = -nuisance.columns[number]
+        groups.append(replace(group, matrix=np.hstack([group.matrix, late])))
+    names = (*problem.names, *(f"delay {joint}" for joint in joints))
+    wide = replace(problem, names=names, groups=tuple(groups), units=(), nuisances=())
+    fit = WeightedLeastSquares(CovarianceSettings("hac")).fit(wide)
+    count = len(joints)
+    return _together(joints, before + fit.values[-count:], fit.std[-count:], "from the base model")
 
 
 def _unknown(stretches: Sequence[DelayData], why: str) -> Delay:
