@@ -317,7 +317,7 @@ class State:
         while True:
             self.evidence.replace([*fixed, *(one.rows for one in inside)])
             values = self.evidence.full.values[place:]
-            over = [abs(value) * one.unit / one.size for one, value in zip(inside, values, strict=True)]
+            over = [abs(v) * one.unit / max(one.size, 1e-300) for one, v in zip(inside, values, strict=True)]
             if max(over, default=0.0) <= 1.0:
                 break
             # Without the farthest one the others may be inside.

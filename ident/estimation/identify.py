@@ -28,7 +28,7 @@ from ident.estimators.physical import cad_prior
 from ident.estimators.problem import Problem
 from ident.model.dynamic_model import DynamicModel
 from ident.model.signals import signals_entry
-from ident.rows.delay import Delay, delay_alone
+from ident.rows.delay import SHIFT_S, Delay, delay_alone
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
 
 logger = logging.getLogger(__name__)
-# Estimates of a delay by the base model, each at the one before.
-_DELAY_STEPS = 2
+# Estimates of a delay by the base model, each at the one before, at most.
+_DELAY_STEPS = 4
 
 
 @dataclass(frozen=True)
@@ -534,30 +534,34 @@ def _late(
     """
     if signals.motor_delay_s != "estimate" or not any(one.alone for one in made):
         return made
-    found = list(made)
+    found, late = list(made), [k for k, one in enumerate(made) if one.alone]
+    delays: list[Delay] = []
     for _ in range(_DELAY_STEPS):
-        problem = stack([one.problem for one in found])
-        nuisances = iter(problem.nuisances)
-        own = [next(nuisances) if one.problem.nuisances else None for one in found]
+        now = [found[k].delay_s for k in late]
+        shifted = []
+        for shift in (SHIFT_S, -SHIFT_S):
+            moved = [one.problem for one in found]
+            for k, delay_s in zip(late, now, strict=True):
+                moved[k] = make(*of[k], log=False, delay_s=delay_s + shift).problem
+            shifted.append(stack(moved))
         try:
-            delays = {
-                k: delay_alone(problem, nuisance, found[k].delay_s)
-                for k, nuisance in enumerate(own)
-                if nuisance is not None and made[k].alone
-            }
+            whole = stack([one.problem for one in found])
+            delays = delay_alone(whole, late, (shifted[0], shifted[1]), now)
         except DataError as error:
             logger.info("no delay of the motor torques by themselves: %s", error)
             return found
-        for k, delay in delays.items():
+        for k, delay in zip(late, delays, strict=True):
             rows = (
                 found[k]
                 if delay.seconds == found[k].delay_s
                 else make(*of[k], log=False, delay_s=delay.seconds)
             )
             found[k] = rows.late(delay)
-        if not any(delay.seconds for delay in delays.values()):
+        if all(
+            abs(delay.seconds - before) < 0.3 * delay.std for delay, before in zip(delays, now, strict=True)
+        ):
             break
-    for delay in delays.values():
+    for delay in delays:
         logger.info("motor channel %s", delay)
     return found
 

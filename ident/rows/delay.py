@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from fri.errors import DataError
 from ident.dynamics.parameters import Floats
 from ident.estimators.covariance import CovarianceSettings
-from ident.estimators.least_squares import WeightedLeastSquares
-from ident.estimators.problem import Nuisance, Problem, RowGroup
+from ident.estimators.least_squares import WeightedLeastSquares, weighted_solution
+from ident.estimators.problem import Problem, RowGroup
 from ident.rows.content import Kept
 from ident.rows.filters import ParallelFilter, half_width, interpolate_uniform, low_pass
 from lwr_driver.session.spool import Growing, release
@@ -48,6 +48,8 @@ _KNOWN = 0.4
 _LEAST_ROWS = 16
 # Half the step of the derivative by the delay [s].
 _STEP_S = 1e-3
+SHIFT_S = 1e-3
+"""Change of a delay for the derivative by it [s]."""
 # Largest Fvm / stiffness of strain-wave joints, 17 Nm s/rad over 8 kNm/rad: so early an elastic joint looks [s].
 _ELASTIC_S = 2e-3
 # Standard deviation of a stated compliance, as a share of it: within a class of arms stiffness differs by 1.5 times.
@@ -205,27 +207,52 @@ def _together(names: Sequence[str], values: Floats, stds: Floats, how: str) -> D
     return Delay.of(mean, float(np.sum(weights)) ** -0.5 * disagreement, how, by_joint, disagreement)
 
 
-def delay_alone(problem: Problem, nuisance: Nuisance, before: float = 0.0) -> Delay:
-    """Delay of motor torques without joint torques beside them: of the torque against the base model's motion.
+def delay_alone(
+    problem: Problem, records: Sequence[int], shifted: tuple[Problem, Problem], before: Sequence[float]
+) -> list[Delay]:
+    """Delays of motor torques without joint torques beside them: of each record's torque against the base model.
 
-    A torque late by d is tau - d dtau/dt, so a further column -dtau/dt of each joint, beside all base parameters, has
-    the coefficient d. nuisance : with d(target) / d(delay) of the rows of this channel, at the delay `before` [s].
+    A Gauss-Newton step with all base parameters free and a delay of each joint of each record.
+
+    problem : stacked rows of all records with the delays `before` [s] of these `records`. shifted : the same rows with
+    delays `SHIFT_S` longer and shorter.
 
     Raises DataError for rows that do not determine all parameters.
     """
     problem.require_rank()
-    joints = list(dict.fromkeys(problem.groups[number].joint for number in nuisance.columns))
+    values = weighted_solution(problem)[0]
+    longer, shorter = ({(g.record, g.joint): g for g in one.groups if g.side == "motor"} for one in shifted)
+    places = [(k, joint) for k in records for joint in dict.fromkeys(g.joint for g in problem.groups)]
     groups = []
-    for number, group in enumerate(problem.groups):
-        late = np.zeros((len(group.target), len(joints)))
-        if number in nuisance.columns:
-            late[:, joints.index(group.joint)] = -nuisance.columns[number]
+    for group in problem.groups:
+        key, late = (group.record, group.joint), np.zeros((len(group.target), len(places)))
+        if group.side == "motor" and key in places and key in longer and key in shorter:
+            rest = [_residual_at(one[key], values, group.time_index) for one in (longer, shorter)]
+            late[:, places.index(key)] = (rest[1] - rest[0]) / (2.0 * SHIFT_S)
         groups.append(replace(group, matrix=np.hstack([group.matrix, late])))
-    names = (*problem.names, *(f"delay {joint}" for joint in joints))
-    wide = replace(problem, names=names, groups=tuple(groups), units=(), nuisances=())
+    acting = [any(np.any(g.matrix[:, len(values) + k]) for g in groups) for k in range(len(places))]
+    used = [*range(len(values)), *(len(values) + k for k, acts in enumerate(acting) if acts)]
+    names = (*problem.names, *(f"delay {k} {joint}" for k, joint in places))
+    wide = replace(problem, names=names, groups=tuple(groups), units=(), nuisances=()).select(used)
     fit = WeightedLeastSquares(CovarianceSettings("hac")).fit(wide)
-    count = len(joints)
-    return _together(joints, before + fit.values[-count:], fit.std[-count:], "from the base model")
+    found = dict(zip(wide.names, zip(fit.values, fit.std, strict=True), strict=True))
+    delays = []
+    for k, start in zip(records, before, strict=True):
+        mine = {
+            joint: found[f"delay {k} {joint}"]
+            for i, joint in places
+            if i == k and f"delay {k} {joint}" in found
+        }
+        steps, stds = np.array(list(mine.values())).T
+        delays.append(_together(list(mine), start + steps, stds, "from the base model"))
+    return delays
+
+
+def _residual_at(group: RowGroup, values: Floats, wanted: NDArray[np.int64]) -> Floats:
+    """Residual of a group's rows at the wanted time indices, zero where it has none."""
+    rest = group.target - group.matrix @ values
+    place = np.clip(np.searchsorted(group.time_index, wanted), 0, len(rest) - 1)
+    return np.where(group.time_index[place] == wanted, rest[place], 0.0)
 
 
 def _unknown(stretches: Sequence[DelayData], why: str) -> Delay:

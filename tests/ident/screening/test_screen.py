@@ -88,6 +88,18 @@ def test_both_sides_reversed_make_a_negative_inertia(pair: list[Session]) -> Non
     assert any(doubt.certain and "negative" in doubt.seen for doubt in doubts(both))
 
 
+@pytest.mark.parametrize("up", [(1, 0, 0), (0, -1, 0), (0, 0, -1)])
+def test_an_arm_on_a_wall_or_a_ceiling_is_told_by_its_gravity(
+    pair: list[Session], up: tuple[int, int, int]
+) -> None:
+    """The data are of an upright arm; the chain is of the same arm with its base turned in the gravity."""
+    turned = replace(chain(), gravity=-9.81 * np.array(up, dtype=float))
+    for sessions in (pair, without("motor", lambda logs: logs)(pair)):
+        found = screen(sessions, turned)
+        assert (found[0].channel, found[0].certain) == ("mounting", True)
+        assert "gravity along [0, 0, -1]" in str(found[0])
+
+
 @pytest.mark.parametrize(
     ("side", "joint", "gain"), [("joint", "A2", 1.3), ("joint", "A3", 0.7), ("motor", "A2", 1.3)]
 )

@@ -64,3 +64,11 @@ def test_intervals_are_counted_by_kind() -> None:
 def test_sessions_without_a_torque_error_are_looked_at() -> None:
     line = verdict("sessions without torque error", unscored=[{"session": "a.mcap", "reason": "too short"}])
     assert (line.level, line.found) == ("look", "a.mcap: too short")
+
+
+def test_each_warning_of_the_estimate_is_a_line_to_look_at() -> None:
+    lines = verdicts(ResultFolder(Path("nowhere"), SUMMARY | {"warnings": ["A2 is swapped", "A3 is dead"]}))
+    assert [(line.found, line.level) for line in lines if line.subject == "warning"] == [
+        ("A2 is swapped", "look"),
+        ("A3 is dead", "look"),
+    ]
