@@ -33,6 +33,8 @@ _ROOT2 = np.sqrt(2.0)
 _REWEIGHTINGS = 8
 # The solver resolves eight digits: no class is trusted beyond 1e-5 of its torque.
 _FINEST = 1e10
+# Tolerances of the conic program, the next one where the arithmetic does not reach the first.
+_TOLERANCES = (1e-10, 1e-8, 1e-6)
 
 
 @dataclass(frozen=True)
@@ -199,14 +201,18 @@ class PhysicallyConsistent:
         if self._feasible(best):
             return best
         rows, offset, cones = self._constraints()
-        moved = _conic(
-            sparse.eye(len(size), format="csc"),
-            np.zeros(len(size)),
-            rows @ spread,
-            offset - rows @ best,
-            cones,
-        )
-        return best + spread @ moved
+        left = offset - rows @ best
+        try:
+            curvature = sparse.csc_matrix(np.eye(len(size)))
+            return np.asarray(
+                best + spread @ _conic(curvature, np.zeros(len(size)), rows @ spread, left, cones)
+            )
+        except DataError:
+            # So far from the possible that these units are of no use: each parameter in its own.
+            own = np.zeros((quadratic.shape[1], len(size)))
+            own[used] = np.diag(1.0 / size)
+            curvature = sparse.csc_matrix(np.triu(r.T @ r))
+            return np.asarray(best + own @ _conic(curvature, np.zeros(len(size)), rows @ own, left, cones))
 
     @property
     def _start(self) -> Floats:
@@ -323,20 +329,20 @@ def _run(quadratic: sparse.csc_matrix, linear: Floats, rows: Floats, offset: Flo
 
 def _conic(curvature: sparse.csc_matrix, linear: Floats, rows: Floats, offset: Floats, cones: list) -> Floats:
     """The least x^T curvature x / 2 + linear^T x with offset - rows x in the cones."""
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.tol_gap_abs = settings.tol_gap_rel = 1e-10
-    settings.tol_feas = 1e-10
-    result = clarabel.DefaultSolver(
-        curvature, linear, sparse.csc_matrix(rows), offset, cones, settings
-    ).solve()
-    status = str(result.status)
-    if status not in ("Solved", "AlmostSolved"):
-        raise DataError(
-            f"the physically consistent program ended with {status}; check the prior's masses and the "
-            "parameters' units, or raise `strength`"
-        )
-    return np.array(result.x)
+    status = ""
+    for tolerance in _TOLERANCES:
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+        solver = clarabel.DefaultSolver(curvature, linear, sparse.csc_matrix(rows), offset, cones, settings)
+        result = solver.solve()
+        status = str(result.status)
+        if status in ("Solved", "AlmostSolved"):
+            return np.array(result.x)
+    raise DataError(
+        f"the physically consistent program ended with {status}; check the prior's masses and the "
+        "parameters' units, or raise `strength`"
+    )
 
 
 def _svec(matrix: Floats) -> Floats:

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.commission import compliance_std, delay_std, gain_std, with_far_presliding
+from ident.diagnosis.evidence import Score
 from ident.diagnosis.nominal import GAIN_STD, NominalArm
 from ident.diagnosis.reference import DELAY_STD_S, Reference
+from ident.diagnosis.selection import State
+from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, ModelStructure
+from ident.effects import EFFECTS, Shape
 from ident.model import DynamicModel
 
 
@@ -185,3 +191,43 @@ def test_a_cause_is_held_against_what_its_special_case_reaches_on_the_healthy_ar
         assert limits["encoder_eccentricity", joint] == limits["joint_zero_offset", joint]
     more = reference(model, null | {("encoder_eccentricity", 1): 500.0}, 2).limits()
     assert more["encoder_eccentricity", 1] > more["joint_zero_offset", 1]
+
+
+def test_habits_of_healthy_days_are_tolerated_beside_every_cause(chain: Chain) -> None:
+    """A candidate of a gain as on healthy days joins the base, and passes for no other cause."""
+    trials = {
+        "stribeck": Trial(Candidate(EFFECTS["stribeck"], 0), Shape(velocity=0.05), _score(300.0), {}),
+        "gear_ripple": Trial(Candidate(EFFECTS["gear_ripple"], 1), Shape(), _score(400.0, 2), {}),
+        "cable_spring": Trial(Candidate(EFFECTS["cable_spring"], 2), Shape(), _score(120.0), {}),
+    }
+    state = State(None, None, DiagnosisSettings(), {})  # type: ignore[arg-type]
+    state._tolerances = []
+    usual = {"stribeck": True, "gear_ripple": True, "cable_spring": False}
+    state.carried = lambda trial, score=None, *, healthy=True: (  # type: ignore[method-assign]
+        not healthy or not usual[trial.candidate.cause]
+    )
+    found = sorted(trials.values(), key=lambda t: -t.score.gain)
+    # Several coefficients are a shape of their own; one is a size that changes from day to day.
+    assert state.habit(found)
+    assert [one.of for one in state.tolerances()] == [("stribeck", 0)]
+    assert not state.habit([trials["gear_ripple"]])
+    assert not state.habit([trials["cable_spring"]])
+    usual["cable_spring"] = True
+    # Far below the best candidate it changes little.
+    assert not state.habit([trials["gear_ripple"], trials["cable_spring"]])
+
+
+def test_a_limit_grows_with_the_information_of_the_motion_and_falls_with_none() -> None:
+    trial = Trial(Candidate(EFFECTS["stribeck"], 0), Shape(velocity=0.05), _score(300.0), {})
+    for now, limit in ((10.0, 50.0), (30.0, 150.0), (1.0, 50.0), (1e6, 50.0 * 25.0)):
+        dictionary = SimpleNamespace(
+            nearest=lambda trial: "v", information=lambda candidate, now=now: {"v": now}
+        )
+        state = State(
+            dictionary, None, DiagnosisSettings(), {("stribeck", 0): 50.0}, {("stribeck", 0): {"v": 10.0}}
+        )  # type: ignore[arg-type]
+        assert state.usual(trial) == pytest.approx(limit)
+
+
+def _score(gain: float, count: int = 1) -> Score:
+    return Score(gain, gain, np.ones(count), 1.0, lambda: (np.eye(count), 40))

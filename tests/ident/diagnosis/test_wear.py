@@ -68,6 +68,18 @@ def test_a_healthy_day_and_an_arm_without_reference_show_no_wear(
     assert not worn(diagnose(pair(make, friction(1.0)), chain))
 
 
+def test_a_usual_gain_of_a_sensor_is_no_wear_of_its_drive(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    """Of a joint that holds much weight a per cent of the sensor is more torque than its inertia."""
+    share = 2.5 * reference.gain_std
+
+    def scaled(s: Signals) -> None:
+        s["joint"][:, 1] *= 1.0 + share
+
+    assert not worn(diagnose(pair(make, scaled), chain, reference=reference))
+
+
 def test_a_law_that_shares_the_friction_with_the_healthy_one_is_no_wear_beside_itself(
     make: Make, chain: Chain, reference: Reference
 ) -> None:

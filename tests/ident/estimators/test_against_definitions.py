@@ -561,6 +561,26 @@ def test_within_the_possible_the_constraints_change_nothing(metric: str, strengt
     assert found.prior_scale == strength
 
 
+@pytest.mark.parametrize(("best", "digits"), [(0.2, 7.0), (-0.0005, 3.0)])
+def test_the_consistent_program_is_exact_whatever_its_condition(best: float, digits: float) -> None:
+    """Rows that know some combinations far better than others, and the prior the rest: the minimiser, where it is
+    possible, else the one with a friction of zero."""
+    prior = body_prior()
+    turned = np.linalg.qr(np.random.default_rng(8).normal(size=(22, 22)))[0]
+    matrix = (10.0 ** np.linspace(-1.0, digits, 22))[:, None] * turned.T
+    wanted = np.concatenate([1.01 * BODY, 0.5 * BODY, [0.5, best]])
+    found = PhysicallyConsistent(prior).solve(1.0, matrix, matrix @ wanted)
+    free = np.arange(22 if best > 0.0 else 21)
+    start = np.concatenate([prior.inertial.ravel(), [0.0, 0.0]])
+    hessian = matrix.T @ matrix + prior.hessian("pullback")
+    slope = matrix.T @ (matrix @ (found - wanted)) + prior.hessian("pullback") @ (found - start)
+    assert found[21] == pytest.approx(max(best, 0.0), abs=1e-3)
+    for body in (found[:10], found[10:20]):
+        assert np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0.0
+    # Distance from the minimiser in standard deviations.
+    assert slope[free] @ np.linalg.solve(hessian[np.ix_(free, free)], slope[free]) < 1e-6
+
+
 def test_at_the_boundary_the_margin_of_the_prior_is_left() -> None:
     impossible = from_com(1.0, [0.05, -0.02, 0.1], np.diag([0.05, 0.009, 0.003]))
     truth = np.concatenate([BODY, impossible, [0.5, -0.3]])

@@ -110,6 +110,19 @@ def test_a_distance_to_a_prior_is_in_units_of_prior_and_data_together() -> None:
     assert Disagreement(0.0, 0, (), ()).p_value == 1.0
 
 
+@pytest.mark.parametrize(("factor", "scaled"), [(1.0, False), (0.5, True), (1.1, False)])
+def test_a_factor_on_all_parameters_is_told_from_many_small_differences(factor: float, scaled: bool) -> None:
+    random = np.random.default_rng(5)
+    mean = 1.0 + random.uniform(size=12)
+    chi = factor * mean * (1.0 + 0.05 * random.normal(size=12))
+    case = problem(design(), chi, [0.1 * random.normal(size=len(m)) for m in design()])
+    found = Disagreement.between(Prior.independent(mean, 0.2 * mean), case, np.full(3, 100.0))
+    assert found.factor == pytest.approx(factor, abs=4.0 * found.factor_std)
+    assert found.factor_std == pytest.approx(0.2 / np.sqrt(12), rel=0.3)
+    assert (found.scaled, found.strong) == (scaled, scaled)
+    assert ("in all bodies alike" in str(found)) == scaled
+
+
 @pytest.mark.parametrize(("left", "told"), [(0.88, False), (0.92, True)])
 def test_a_parameter_with_nine_tenths_of_its_prior_deviation_left_is_from_the_prior(
     left: float, told: bool
