@@ -28,6 +28,7 @@ from ident.rows.filters import (
     advice,
     block_means,
     differentiate,
+    enough,
     half_width,
     interpolate_uniform,
     low_pass,
@@ -449,6 +450,8 @@ class _Motion:
         period = median_step(actual[low:high])
         # Samples averaged before a low-pass are the same in all blocks.
         together = thinning(period, settings.decimate)
+        if not enough(high - low, period, settings.decimate):
+            return None
         if self.core[0] > -np.inf:
             since = int(np.searchsorted(actual, self.first)) - low
             low += max(-(-since // together), 0) * together
@@ -582,6 +585,8 @@ def _passages(
             continue
         rows = grid[inside]
         joint = motion.channel(settings)
+        if not enough(len(joint.times), joint.period_s, settings.decimate):
+            continue
         motor = motor_valid = None
         if motor_data is not None and delay is not None:
             motor = motion.motor_channel(*motor_data, delay.seconds, settings)
