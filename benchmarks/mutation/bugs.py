@@ -162,4 +162,21 @@ BUGS: tuple[Bug, ...] = (
         "math.sqrt(3 * JOINTS) * 200 * math.pi",
         (f"{_PACKETS}::test_positions_of_more_than_a_turn_are_refused_and_a_turn_of_all_joints_is_not",),
     ),
+    Bug(
+        "a stretch shorter than a mean of its samples is kept",
+        "ident/rows/prepare.py",
+        "        if not enough(len(joint.times), joint.period_s, settings.decimate):\n            continue\n",
+        "",
+        (
+            "tests/ident/rows/test_prepare.py::"
+            "test_a_stretch_of_a_few_samples_between_gaps_gives_no_row_and_no_error",
+        ),
+    ),
+    Bug(
+        "samples of a frozen position stay in the rows",
+        "ident/rows/prepare.py",
+        "| old | unseen",
+        "| old",
+        ("tests/ident/screening/test_screen.py::test_samples_of_a_short_freeze_have_no_part_in_the_rows",),
+    ),
 )

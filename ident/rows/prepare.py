@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import DriveMotion
-from ident.rows.data_quality import held, stale
+from ident.rows.data_quality import frozen_flags, frozen_positions, frozen_torques, held, stale
 from ident.rows.delay import DELAY_DB, DELAY_HZ, Delay, DelayData, estimate_delay
 from ident.rows.filters import (
     Excitation,
@@ -218,7 +218,8 @@ def prepare(
     position_flags, crowded = outliers(position, settings.outlier_scale)
     effort_flags, also = outliers(effort, settings.outlier_scale)
     kept = held(effort, times, times, position) if sensed else np.zeros(len(times), dtype=bool)
-    effort_flags = effort_flags | kept[:, None]
+    stuck = frozen_flags(frozen_torques(effort, times, times, position) if sensed else (), effort.shape)
+    effort_flags = effort_flags | kept[:, None] | stuck
     warnings += _jumping(name, "position", session.joint_names, crowded)
     warnings += _jumping(name, "joint torque", session.joint_names, also)
     names = moving(position, session.joint_names)
@@ -228,7 +229,8 @@ def prepare(
             "not show inertia and friction"
         )
     old = stale(session.joint) if clock is None else clock.repeated
-    bad: BoolArray = np.asarray(position_flags.any(axis=1)) | old
+    unseen = frozen_flags(frozen_positions(session.joint), position.shape).any(axis=1)
+    bad: BoolArray = np.asarray(position_flags.any(axis=1)) | old | unseen
     parts, lost = stretches(times, (position, effort), bad, dt, settings.longest_bridge_s)
     if not parts:
         raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
@@ -244,11 +246,13 @@ def prepare(
     flagged = {
         "stale": int(old.sum()),
         "position_outliers": int(position_flags.sum()),
-        "joint_torque_outliers": int(effort_flags[~kept].sum()),
+        "joint_torque_outliers": int((effort_flags & ~stuck)[~kept].sum()),
         "joint_torque_held": int(kept.sum()),
+        "joint_torque_frozen": int(stuck.sum()),
+        "position_frozen": int(unseen.sum()),
     }
     # A tenth of a gigabyte for an hour.
-    del parts, longest, position_flags, effort_flags, old, kept, bad, times
+    del parts, longest, position_flags, effort_flags, old, kept, stuck, unseen, bad, times
     motor_data = (
         _motor(session, origin, settings, name, warnings, outliers)
         if motor and session.motor is not None
@@ -636,7 +640,9 @@ def _motor(
     flags, crowded = outliers(effort, settings.outlier_scale)
     warnings += _jumping(name, "motor torque", session.joint_names, crowded)
     path_times = np.asarray((reference - origin) * 1e-9, dtype=np.float64)
-    flags = flags | held(effort, times, path_times, session.joint.position)[:, None]
+    path = session.joint.position
+    flags = flags | held(effort, times, path_times, path)[:, None]
+    flags |= frozen_flags(frozen_torques(effort, times, path_times, path), effort.shape)
     effort = effort.copy() if flags.any() else effort
     for joint in np.flatnonzero(flags.any(axis=0)):
         good = ~flags[:, joint]

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
-from ident.rows.data_quality import clipped_at, stuck_at
+from ident.rows.data_quality import (
+    Frozen,
+    clipped_at,
+    frozen_positions,
+    frozen_torques,
+    held,
+    run_bounds,
+    stuck_at,
+)
 from ident.screening.doubts import Doubt
 from lwr_driver.session import JointColumns, Session
 
@@ -32,9 +40,8 @@ _CORNERS, _TOP, _SHARP, _LAG_S = 2, 5, 2.0, 0.02
 _STEP_RAD = 2.0 * np.pi / 4096.0
 # Share of the motion at one torque, wherever it is.
 _OFTEN = 0.05
-# A frozen channel: least length over nearly all (the quantile) of its other runs of one value, and least share of the
-# samples at that value in one run. A dead zone or a coarse sensor comes back to its values again and again.
-_LONGER, _NEARLY, _ONE_RUN = 20.0, 0.99, 0.8
+# Least time [s] of torques kept in all joints at once to be told; shorter ones are usual in a network.
+_TOGETHER_S = 0.1
 # Share of the rows of two logs equal to the last bit.
 _SAME_ROWS = 0.2
 
@@ -244,60 +251,91 @@ def _dead(sessions: Sequence[Session]) -> Iterator[Doubt]:
 
 
 def _frozen(session: Session) -> Iterator[Doubt]:
-    """Channels of single joints that stop in the middle of a motion. All joints at once: lost samples."""
-    name, joint = session.path.name, session.joint
-    for channel, columns, values in [
-        *((channel, columns, columns.effort) for channel, columns in _torques(session)),
-        ("position", joint, joint.position),
-    ]:
-        for k in range(values.shape[1]):
-            first, last = _longest_run(values[:, k])
-            stamps = columns.log_time[[first, last]]
-            span = (joint.log_time >= stamps[0]) & (joint.log_time <= stamps[1])
-            if (stamps[1] - stamps[0]) * 1e-9 < _LONG_S or not span.any():
-                continue
-            others = np.delete(values[first : last + 1], k, axis=1)
-            if others.shape[1] and not np.any(
-                np.ptp(others, axis=0) > (_MOVED if channel == "position" else 0.0)
-            ):
-                continue
-            if channel == "position":
-                stopped = _driven(session, k, stamps) or _abrupt(joint, k, first, last)
-            else:
-                stopped = np.ptp(joint.position[span, k]) > _MOVED and _once(values[:, k], first, last)
-            if not stopped or last - first + 1 == len(values):
-                continue
-            start, end = (stamps - joint.log_time[0]) * 1e-9
-            seen = f"reads {values[first, k]:.4g} from {start:.1f} to {end:.1f} s, in the middle of a motion"
-            mend = "cut that part off the log, or repair the channel"
-            certain = last - first > _OFTEN * len(values)
-            yield Doubt(
-                channel,
-                (session.joint_names[k],),
-                seen,
-                "a frozen channel",
-                mend,
-                certain,
-                name,
-                lost=channel != "position",
-            )
+    """Channels that stop in the middle of a motion."""
+    joint = session.joint
+    path_times = np.asarray((joint.log_time - joint.log_time[:1]) * 1e-9, dtype=np.float64)
+    for channel, columns in _torques(session):
+        times = np.asarray((columns.log_time - joint.log_time[:1]) * 1e-9, dtype=np.float64)
+        effort = columns.effort
+        runs = frozen_torques(effort, times, path_times, joint.position)
+        yield from _stopped(session, channel, times, effort, runs)
+        kept = np.flatnonzero(np.diff(held(effort, times, path_times, joint.position), prepend=0, append=0))
+        together = [(int(a) - 1, int(b) - 1) for a, b in kept.reshape(-1, 2)]
+        long = [(a, b) for a, b in together if times[b] - times[a] >= _TOGETHER_S]
+        if long:
+            seen, share = _spans(times, long), sum(b - a for a, b in long) / len(times)
+            mend = "these samples are left out; look for what held the recording up"
+            seen = f"every joint keeps its value {seen}, while the arm moves"
+            yield Doubt(channel, (), seen, "lost samples", mend, share > _OFTEN, session.path.name)
+    runs = frozen_positions(joint)
+    yield from _stopped(session, "position", path_times, joint.position, runs)
+    jumping = {run.joint for run in runs}
+    rest = [run for k, run in enumerate(_standing(session)) if run is not None and k not in jumping]
+    for run in rest:
+        yield from _stopped(session, "position", path_times, joint.position, (run,), kept=True)
 
 
-def _longest_run(values: Floats) -> tuple[int, int]:
-    """First and last sample of the longest run of one value."""
-    edges = np.flatnonzero(np.diff(values) != 0.0) + 1
-    bounds = np.concatenate([[0], edges, [len(values)]])
-    longest = int(np.argmax(np.diff(bounds)))
-    return int(bounds[longest]), int(bounds[longest + 1]) - 1
+def _stopped(
+    session: Session,
+    channel: str,
+    times: Floats,
+    values: Floats,
+    runs: Sequence[Frozen],
+    *,
+    kept: bool = False,
+) -> Iterator[Doubt]:
+    """Doubts about frozen channels; joints that freeze at the same times share one. kept : in the rows."""
+    together: dict[tuple[tuple[int, int], ...], list[int]] = {}
+    for joint in dict.fromkeys(run.joint for run in runs):
+        spans = tuple((run.first, run.last) for run in runs if run.joint == joint)
+        together.setdefault(spans, []).append(joint)
+    for spans, joints in together.items():
+        share = sum(last - first for first, last in spans) / len(times)
+        longest = max(spans, key=lambda span: span[1] - span[0])
+        alone = len(joints) == 1
+        value = f"reads {values[longest[0], joints[0]]:.4g}" if alone else "keep their values"
+        certain = kept or share > _OFTEN
+        mend = "cut that part off the log, or repair the channel"
+        yield Doubt(
+            channel,
+            tuple(session.joint_names[joint] for joint in joints),
+            f"{value} {_spans(times, spans)}, in the middle of a motion",
+            "a frozen channel" if alone else "lost samples, or frozen channels",
+            mend if certain else "these samples are left out; repair the channel",
+            certain,
+            session.path.name,
+            lost=channel != "position" and certain,
+        )
 
 
-def _once(values: Floats, first: int, last: int) -> bool:
-    """Whether a run is far longer than others, inside the range, and nearly all there is of its value."""
-    lengths = np.diff(np.concatenate([[0], np.flatnonzero(np.diff(values) != 0.0) + 1, [len(values)]]))
-    count = last - first + 1
-    usual = float(np.quantile(lengths, _NEARLY)) if len(lengths) > 2 else np.inf
-    inside = values.min() < values[first] < values.max()
-    return bool(inside and count > _LONGER * usual and count > _ONE_RUN * np.sum(values == values[first]))
+def _spans(times: Floats, spans: Sequence[tuple[int, int]]) -> str:
+    """The longest of some spans of samples in words, and how many there are."""
+    first, last = max(spans, key=lambda span: times[span[1]] - times[span[0]])
+    start, end = times[[first, last]]
+    places = 1 if end - start >= _LONG_S else 2
+    text = f"from {start:.{places}f} to {end:.{places}f} s ({end - start:.{places}f} s)"
+    if len(spans) > 1:
+        total = sum(times[b] - times[a] for a, b in spans)
+        text += f" and {len(spans) - 1} more times, {total:.{places}f} s in all"
+    return text
+
+
+def _standing(session: Session) -> Iterator[Frozen | None]:
+    """By joint, its longest standstill, if it was to move then, or stopped or left at speed, while others moved."""
+    joint = session.joint
+    for k, values in enumerate(joint.position.T):
+        bounds = run_bounds(values)
+        longest = int(np.argmax(np.diff(bounds)))
+        first, last = int(bounds[longest]), int(bounds[longest + 1]) - 1
+        stamps = joint.log_time[[first, last]]
+        others = np.delete(joint.position[first : last + 1], k, axis=1)
+        found = (
+            (stamps[1] - stamps[0]) * 1e-9 >= _LONG_S
+            and last - first + 1 < len(values)
+            and bool(not others.shape[1] or np.any(np.ptp(others, axis=0) > _MOVED))
+            and (_driven(session, k, stamps) or _abrupt(joint, k, first, last))
+        )
+        yield Frozen(k, first, last) if found else None
 
 
 def _driven(session: Session, joint: int, stamps: NDArray[np.int64]) -> bool:
