@@ -20,6 +20,7 @@ from ident.rows.data_quality import (
     run_bounds,
     stuck_at,
 )
+from ident.rows.shared_rows import SAME_ROWS, row_numbers, shared
 from ident.screening.doubts import Doubt
 from lwr_driver.session import JointColumns, Session
 
@@ -42,8 +43,6 @@ _STEP_RAD = 2.0 * np.pi / 4096.0
 _OFTEN = 0.05
 # Least time [s] of torques kept in all joints at once to be told; shorter ones are usual in a network.
 _TOGETHER_S = 0.1
-# Share of the rows of two logs equal to the last bit.
-_SAME_ROWS = 0.2
 
 
 def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
@@ -100,12 +99,13 @@ def _torques(session: Session) -> Iterator[tuple[str, JointColumns]]:
 
 
 def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
+    numbers = {id(session): row_numbers(session) for session in sessions} if len(sessions) > 1 else {}
     for a, b in combinations(sessions, 2):
-        share = _shared_rows(a, b)
+        share = shared(numbers[id(a)], numbers[id(b)])
         uid = a.metadata.get("uid", "")
         alike = f" and the uid {uid}" if uid and uid == b.metadata.get("uid", "") else ""
         names = f"{a.path.name} and {b.path.name}"
-        if share > _SAME_ROWS:
+        if share > SAME_ROWS:
             seen = f"{names} hold the same samples ({100 * share:.0f} %){alike}"
             yield Doubt(
                 "log", (), seen, "one log given twice", "give each log once; a copy is no new data", True
@@ -115,32 +115,6 @@ def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
             seen = f"{names} hold different samples{alike}"
             advice = "leave one out if it was made from the other; two recordings may stay"
             yield Doubt("log", (), seen, "one log processed into another", advice, False)
-
-
-def _shared_rows(a: Session, b: Session) -> float:
-    """Share of the rows of the shorter log found in the other to the last bit, in motion."""
-    one, two = (np.unique(_row_hashes(session)) for session in (a, b))
-    fewer = min(len(one), len(two))
-    return len(np.intersect1d(one, two, assume_unique=True)) / fewer if fewer else 0.0
-
-
-def _row_hashes(session: Session) -> NDArray[np.uint64]:
-    """A number of 64 bits for each row in motion, equal for rows equal to the last bit."""
-    sides = [session.joint.position, session.joint.effort]
-    if session.motor is not None and not session.joint.effort.size:
-        sides = [session.motor.effort]
-    count = len(sides[0])
-    found, moving = np.zeros(count, dtype=np.uint64), np.ones(count, dtype=bool)
-    moving[:1] = False
-    for values in sides:
-        for column in values.T:
-            # The finaliser of splitmix64 (Steele, Lea and Flood, 2014).
-            bits = np.ascontiguousarray(column).view(np.uint64) ^ (found * np.uint64(0x9E3779B97F4A7C15))
-            bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-            bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-            found = bits ^ (bits >> np.uint64(31))
-            moving[1:] &= column[1:] != column[:-1]
-    return found[moving] if moving.sum() > 100 else found
 
 
 def _never_moving(sessions: Sequence[Session]) -> Iterator[Doubt]:
