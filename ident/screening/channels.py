@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
+from ident.rows.content import content
 from ident.rows.data_quality import (
     Frozen,
     clipped_at,
@@ -23,6 +24,7 @@ from ident.rows.data_quality import (
 from ident.rows.shared_rows import SAME_ROWS, row_numbers, shared
 from ident.screening.doubts import Doubt
 from lwr_driver.session import JointColumns, Session
+from lwr_driver.session.spool import column
 
 # Sampling rates of robot logs [Hz], and the least duration for a comparison of two clocks [s].
 _RATES, _LONG_S = (10.0, 20_000.0), 2.0
@@ -49,6 +51,7 @@ def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts about the channels of sessions with the joints of `chain`."""
     found = [*_repeated(sessions), *_never_moving(sessions), *_dead(sessions)]
     for session in sessions:
+        found += _copied(session)
         frozen = list(_frozen(session))
         named = {(doubt.channel, doubt.joints) for doubt in frozen}
         clipped = [doubt for doubt in _clipped(session) if (doubt.channel, doubt.joints) not in named]
@@ -222,6 +225,23 @@ def _dead(sessions: Sequence[Session]) -> Iterator[Doubt]:
                 yield Doubt(
                     channel, names, seen, "a dead sensor", mend, certain, session.path.name, lost=True
                 )
+
+
+def _copied(session: Session) -> Iterator[Doubt]:
+    """Torques of several joints equal to the last bit in every sample, as two sensors never are."""
+    for channel, columns in _torques(session):
+        silent = set(dead(columns))
+        alike: dict[bytes, list[int]] = {}
+        for joint in range(columns.effort.shape[1]):
+            if joint not in silent:
+                alike.setdefault(content(column(columns.effort, joint)), []).append(joint)
+        for joints in alike.values():
+            if len(joints) > 1:
+                names = tuple(session.joint_names[joint] for joint in joints)
+                seen = "read the same to the last bit in every sample"
+                looks = "one column taken for several joints"
+                mend = "give each joint its own column when importing"
+                yield Doubt(channel, names, seen, looks, mend, True, session.path.name)
 
 
 def _frozen(session: Session) -> Iterator[Doubt]:

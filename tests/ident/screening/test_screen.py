@@ -153,6 +153,23 @@ def test_channels_that_contradict_themselves_are_named(pair: list[Session]) -> N
     assert check_channels(with_speed()(pair), chain()) == []
 
 
+@pytest.mark.parametrize("side", ["joint", "motor"])
+def test_a_torque_that_is_a_copy_of_another_joints_is_an_error(pair: list[Session], side: str) -> None:
+    columns = getattr(pair[1], side)
+    effort = columns.effort.copy()
+    effort[:, 4] = effort[:, 2]
+    copied = replace(pair[1], **{side: replace(columns, effort=effort)})
+    (found,) = screen([pair[0], copied], chain())
+    assert (found.channel, found.joints, found.session) == (f"{side} torque", ("E1", "A4"), "loaded.mcap")
+    assert found.certain
+    # Two dead sensors are no copies, nor are torques equal but for one sample.
+    effort[17, 4] += 1e-9
+    assert screen([pair[0], replace(pair[1], **{side: replace(columns, effort=effort)})], chain()) != (found,)
+    effort[:, [2, 4]] = 0.0
+    silent = check_channels([replace(pair[1], **{side: replace(columns, effort=effort)})], chain())
+    assert {doubt.looks_like for doubt in silent} == {"a dead sensor"}
+
+
 @pytest.mark.parametrize(
     ("channel", "field", "name"),
     [
