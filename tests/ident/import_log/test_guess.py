@@ -288,3 +288,17 @@ def test_small_currents_in_milliamperes_are_known_by_their_name(arm: Path, tmp_p
         guess = guess_mapping(path, arm, Known(torque_constant=(0.1,), gear_ratio=(100.0,)))
         assert guess.mapping.motor_torque is not None
         assert guess.mapping.motor_torque.unit == unit
+
+
+def test_a_velocity_left_out_is_followed_by_the_reason(arm: Path, tmp_path: Path) -> None:
+    names = ["t", *columns("q{k}"), *columns("dq{k}"), *columns("tau{k}")]
+    holed = QD.copy()
+    holed[17, 3] = np.nan
+    for rate, reason in (
+        (holed, "missing values in 1 row, first in row 17"),
+        (QD[::-1], "not dq/dt of the positions in any unit"),
+    ):
+        guess = guess_mapping(write(tmp_path / "run.csv", names, T, Q, rate, TAU), arm)
+        assert guess.mapping.velocity is None
+        assert guess.unused == (f"dq1 ... dq7 ({reason})",)
+        assert f"not used: dq1 ... dq7 ({reason})" in str(guess)
