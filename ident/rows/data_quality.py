@@ -33,8 +33,9 @@ _HELD = 5.0
 # A frozen channel: least samples, least time [s], least length over the usual time between two values.
 _FEWEST, _FROZEN_S = 5, 0.05
 # Least speed of the jump behind a frozen position over the speed afterwards, and over the largest usual change of speed
-# (its quantile). A step of an encoder of 12 bits [rad] is no jump.
-_JUMP, _NEARLY_ALL, _STEP_RAD = 2.0, 0.999, 2.0 * np.pi / 4096.0
+# (its quantile). A step of an encoder of 12 bits [rad] is no jump. Least speed before a halt over that change: a brake
+# needs several samples for it, a frozen position none.
+_JUMP, _NEARLY_ALL, _STEP_RAD, _HALT = 2.0, 0.999, 2.0 * np.pi / 4096.0, 10.0
 # A frozen torque: least length over nearly all (the quantile) of its other runs of one value, and least share of the
 # samples at that value in one run. A dead zone or a coarse sensor comes back to its values again and again.
 _LONGER, _NEARLY, _ONE_RUN = 20.0, 0.99, 0.8
@@ -156,7 +157,7 @@ def held(effort: Floats, times: Floats, path_times: Floats, path: Floats) -> Fla
 
 
 def frozen_positions(columns: JointColumns) -> tuple[Frozen, ...]:
-    """Positions at one value for long that end by a jump: the joint went on unseen.
+    """Positions at one value for long that end by a jump, or begin by a halt in one sample while other joints move.
 
     A joint that leaves a rest gains speed from one sample to the next. After a jump it is slower than in the jump.
     """
@@ -168,28 +169,35 @@ def frozen_positions(columns: JointColumns) -> tuple[Frozen, ...]:
     for joint in range(columns.position.shape[1]):
         values = column(columns.position, joint)
         bounds = run_bounds(values)
-        count, last = np.diff(bounds)[:-1], bounds[1:-1] - 1
-        if len(count) < 2:
+        first, last = bounds[:-1], bounds[1:] - 1
+        if len(first) < 3:
             continue
-        way = np.diff(values)
+        count = last - first + 1
         long = (count >= max(_FEWEST, _HELD * float(np.median(count)))) & (
-            times[last] - times[bounds[:-2]] >= _FROZEN_S
+            times[last] - times[first] >= _FROZEN_S
         )
-        least = max(_STEP_RAD, _STEPS * float(np.abs(way[last]).min()))
-        ends = last[long & (np.abs(way[last]) > least)]
-        if not len(ends):
-            continue
+        way = np.diff(values)
         speed = way / step
+        coarse = max(_STEP_RAD, _STEPS * float(np.abs(way[last[:-1]]).min()))
+        jumps = long[:-1] & (np.abs(way[last[:-1]]) > coarse)
+        # The change of speed at a halt, and those before and behind a jump, are not usual ones.
         usual = np.ones(len(speed) - 1, dtype=bool)
-        # A change of speed before and one behind each jump.
-        usual[np.clip(np.concatenate([ends - 1, ends]), 0, len(usual) - 1)] = False
-        change = np.abs(np.diff(speed))[usual]
-        limit = _JUMP * float(np.quantile(change, _NEARLY_ALL)) if len(change) else np.inf
-        for end in ends:
-            after = np.max(np.abs(speed[end + 1 : end + 1 + _FEWEST]), initial=0.0)
-            if abs(speed[end]) > max(limit, _JUMP * float(after)):
-                first = int(bounds[np.searchsorted(bounds, end, side="right") - 1])
-                found.append(Frozen(joint, first, int(end)))
+        places = (first[long] - 1, last[:-1][jumps] - 1, last[:-1][jumps])
+        usual[np.clip(np.concatenate(places), 0, len(usual) - 1)] = False
+        change = np.abs(np.diff(speed))
+        limit = float(np.quantile(change[usual], _NEARLY_ALL)) if usual.any() else np.inf
+        for k in np.flatnonzero(long):
+            start, end = int(first[k]), int(last[k])
+            jumped = halted = False
+            if k < len(jumps) and jumps[k]:
+                after = float(np.max(np.abs(speed[end + 1 : end + 1 + _FEWEST]), initial=0.0))
+                jumped = abs(speed[end]) > _JUMP * max(limit, after)
+            if start > 0 and abs(speed[start - 1]) > _HALT * limit:
+                span = times[end] - times[start]
+                others = np.ptp(np.delete(columns.position[start : end + 1], joint, axis=1), axis=0)
+                halted = bool(np.any(others > _WAY * min(span / _WAY_S, 1.0)))
+            if jumped or halted:
+                found.append(Frozen(joint, start, end))
     return tuple(found)
 
 

@@ -260,6 +260,36 @@ def test_samples_of_a_short_freeze_have_no_part_in_the_rows(pair: list[Session])
     assert not motor.known[(motor.times > 10.05) & (motor.times < 10.95), 1].any()
 
 
+def test_a_position_that_halts_at_once_while_others_move_is_frozen(pair: list[Session]) -> None:
+    """The joint comes back to where it froze, or stays frozen until the end; a brake is no frozen position."""
+    whole = replace(pair[0], command=None)
+    position, period = whole.joint.position, whole.joint.period_s
+    count = len(position)
+    speed = np.abs(position[50:] - position[:-50]) / (50 * period)
+    joint = 2
+    first = int(np.argmax(speed[: count // 2, joint])) + 25
+    back = (
+        first
+        + 75
+        + int(np.argmin(np.abs(position[first + 75 : first + 500, joint] - position[first, joint])))
+    )
+    assert np.ptp(position[first:back, joint]) > 0.3
+    assert abs(position[back, joint] - position[first, joint]) < 0.005
+    for last in (back, count):
+        still = position.copy()
+        still[first:last, joint] = still[first, joint]
+        frozen_log = replace(whole, joint=replace(whole.joint, position=still))
+        found = [d for d in check_channels([frozen_log], chain()) if d.channel == "position"]
+        assert [(d.joints, d.looks_like) for d in found] == [(("E1",), "a frozen channel")]
+    # Speed falls to nothing in a tenth of a second, and rises again as fast.
+    time = np.arange(count) * period
+    rate = np.gradient(position[:, joint], period)
+    rate *= np.clip(np.abs(time - time[first] - 0.5) / 0.1 - 4.0, 0.0, 1.0)
+    braked = position.copy()
+    braked[:, joint] = np.cumsum(rate) * period
+    assert check_channels([replace(whole, joint=replace(whole.joint, position=braked))], chain()) == []
+
+
 def test_positions_that_no_jump_follows_are_not_frozen(pair: list[Session]) -> None:
     whole = replace(pair[0], command=None)
     columns, position = whole.joint, whole.joint.position
