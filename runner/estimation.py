@@ -124,14 +124,22 @@ def recorded_couplings(sessions: Sequence[Session]) -> tuple[str, ...]:
     )
 
 
-def announced(sessions: Sequence[Session], payloads: Sequence[str]) -> list[Session]:
-    """The sessions with the payloads given as `FILE=NAME[:KG]` in place of their metadata."""
+def announced(
+    sessions: Sequence[Session], payloads: Sequence[str], typed: Sequence[Path] = ()
+) -> list[Session]:
+    """The sessions with the payloads given as `FILE=NAME[:KG]` in place of their metadata.
+
+    typed : the recordings of the sessions as named by the user, whose sessions may be imports of another name.
+    """
     corrected = list(sessions)
-    known = ", ".join(session.path.name for session in sessions)
+    files = [{str(session.path), session.path.name} for session in sessions]
+    for path, names in zip(typed, files, strict=False):
+        names |= {str(path), path.name}
+    known = ", ".join(path.name for path in (typed or [session.path for session in sessions]))
     for text in payloads:
         file, mark, payload = text.rpartition("=")
         name, _, mass = payload.partition(":")
-        places = [k for k, session in enumerate(sessions) if file in (str(session.path), session.path.name)]
+        places = [k for k, names in enumerate(files) if file in names]
         if not mark or not name or len(places) != 1:
             raise ConfigurationError(
                 f"--payload {text!r}: write FILE=NAME or FILE=NAME:KG with one of the files {known}"

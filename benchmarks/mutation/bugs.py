@@ -162,4 +162,38 @@ BUGS: tuple[Bug, ...] = (
         "math.sqrt(3 * JOINTS) * 200 * math.pi",
         (f"{_PACKETS}::test_positions_of_more_than_a_turn_are_refused_and_a_turn_of_all_joints_is_not",),
     ),
+    Bug(
+        "a stretch shorter than a mean of its samples is kept",
+        "ident/rows/prepare.py",
+        "        if not enough(len(joint.times), joint.period_s, settings.decimate):\n            continue\n",
+        "",
+        (
+            "tests/ident/rows/test_prepare.py::"
+            "test_a_stretch_of_a_few_samples_between_gaps_gives_no_row_and_no_error",
+        ),
+    ),
+    Bug(
+        "samples of a frozen position stay in the rows",
+        "ident/rows/prepare.py",
+        "| old | unseen",
+        "| old",
+        ("tests/ident/screening/test_screen.py::test_samples_of_a_short_freeze_have_no_part_in_the_rows",),
+    ),
+    Bug(
+        "a copy of a log of the estimate is held out",
+        "ident/estimation/validate.py",
+        "or by_file or alike)",
+        "or by_file)",
+        (
+            "tests/ident/estimation/test_validation_of_models.py::"
+            "test_a_copy_of_a_session_of_the_estimate_is_no_held_out_one",
+        ),
+    ),
+    Bug(
+        "a torque that is a copy of another joint's is not named",
+        "ident/screening/channels.py",
+        "        found += _copied(session)\n",
+        "",
+        ("tests/ident/screening/test_screen.py::test_a_torque_that_is_a_copy_of_another_joints_is_an_error",),
+    ),
 )

@@ -33,6 +33,7 @@ from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
 from ident.rows.sessions import payload_name, require
+from ident.rows.shared_rows import marks
 from ident.rows.signal_choice import choose_signals
 from ident.rows.timebase import KnownOutliers, Outliers
 from ident.screening.screen import require_sound, without_dead
@@ -105,7 +106,8 @@ class Identification(Tabular):
     base : the base parameters and their regrouping. estimate : values, covariance and residuals.
     prepared : the filtered sessions, without their samples. problem : the stacked regression.
     warnings : sentences for the report. choice : of the estimator, with "auto". known : of the sessions, for a further
-    identification of them. effects : of the model beside its parameters (sensor gains).
+    identification of them. effects : of the model beside its parameters (sensor gains). marks : of the rows of each
+    session, by which a copy is known (`ident.rows.shared_rows`).
     """
 
     settings: IdentificationSettings
@@ -124,6 +126,7 @@ class Identification(Tabular):
     known: Known = field(default_factory=Known)
     choice: Choice | None = None
     effects: tuple[Mapping[str, Any], ...] = ()
+    marks: tuple[str, ...] = ()
 
     @cached_property
     def model(self) -> DynamicModel:
@@ -146,7 +149,10 @@ class Identification(Tabular):
             "covariance": self.estimate.covariance.kind,
             "sessions": [
                 {"file": session.name, "uid": session.uid, "payload": payload or "none"}
-                for session, payload in zip(self.prepared, self.payloads, strict=True)
+                | ({"rows": rows} if rows else {})
+                for session, payload, rows in zip(
+                    self.prepared, self.payloads, self.marks or ("",) * len(self.prepared), strict=True
+                )
             ],
             "signals": signals_entry(self.settings.signals, self.prepared),
         }
@@ -295,6 +301,11 @@ class Observed:
     known: Known
 
     @cached_property
+    def marks(self) -> tuple[str, ...]:
+        """Marks of the rows of each session."""
+        return tuple(marks(session) for session in self.sessions)
+
+    @cached_property
     def full_rank(self) -> bool:
         """Whether the motion shows all parameters."""
         return bool(np.isfinite(self.problem.normalised_condition))
@@ -349,6 +360,7 @@ class Observed:
             robot=settings.robot or self.sessions[0].metadata.get("robot", "") or "arm",
             warnings=tuple(warnings),
             known=self.known,
+            marks=self.marks,
         )
 
 

@@ -26,6 +26,7 @@ from ident.model.signals import signal_settings
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import payload_name
+from ident.rows.shared_rows import from_marks, seen_before
 from ident.screening.doubts import Doubt, settle
 from ident.screening.screen import require_sound, screen
 from lwr_driver.listing import Listing, Piece, text_of
@@ -179,8 +180,8 @@ def validate(
         try:
             if flag and not allow_seen:
                 raise DataError(
-                    f"{session.path.name}: the model was fitted to this session, so predicting it proves "
-                    "nothing; give a session of another motion, or --allow-seen to see the fit anyway"
+                    f"{session.path.name}: the model was fitted to this session or a copy of it, so predicting it "
+                    "proves nothing; give a session of another motion, or --allow-seen to see the fit anyway"
                 )
             predict = predictor(model, mounted(model, session))
             settle([doubt for doubt in doubts if doubt.certain and doubt.session in ("", session.path.name)])
@@ -239,21 +240,24 @@ def predictor(model: DynamicModel, payload: str | None) -> Predictor:
 
 
 def seen_sessions(model: DynamicModel, sessions: Sequence[Session]) -> list[bool]:
-    """Whether the model was fitted to each session, by the uids (or file names) in its provenance."""
+    """Whether the model was fitted to each session, by the uids (or file names) and the rows in its provenance."""
     entries = model.provenance.get("sessions", ())
-    uids, files = set(), set()
+    uids, files, rows = set(), set(), []
     for entry in entries if isinstance(entries, (list, tuple)) else ():
         if isinstance(entry, Mapping):
             uids.add(str(entry.get("uid", "")))
+            rows.append(from_marks(str(entry.get("rows", ""))))
         else:
             uids.add(str(entry))
             files.add(str(entry))
     experiment = str(model.provenance.get("experiment", ""))
+    joints = model.structure.chain.joint_names
     found = []
     for session in sessions:
         uid = session.metadata.get("uid", "")
         by_file = session.path.name in files and session.metadata.get("experiment", "") == experiment
-        found.append(bool(uid and uid in uids) or by_file)
+        alike = set(joints) <= set(session.joint_names) and seen_before(session.select(joints), rows)
+        found.append(bool(uid and uid in uids) or by_file or alike)
     return found
 
 

@@ -42,6 +42,8 @@ _ASIDE = _words(
 _SENSED = _words("sm sensor sensed measured meas msr actual act fb feedback real raw")
 _FILTERED = _words("filt filtered filter smooth smoothed lp lowpass")
 _MOTOR = _words("motor mot motors drive actuator")
+_UNITS = {"mnm": r"mN[.·*-]?m(?![A-Za-z])|N[.·*-]?mm(?![A-Za-z])", "ma": r"(?<![A-Za-z])mA(?![A-Za-z])"}
+"""Units of two cases, each one word."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,10 @@ class Field:
     @property
     def words(self) -> tuple[str, ...]:
         """Words of the name in lower case, plurals as singulars."""
-        parts = re.findall("[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", self.name).lower())
+        name = self.name
+        for unit, spelling in _UNITS.items():
+            name = re.sub(spelling, f" {unit} ", name)
+        parts = re.findall("[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower())
         known = frozenset().union(_ASIDE, _SENSED, *QUANTITIES.values())
         return tuple(part[:-1] if part not in known and part[:-1] in known else part for part in parts)
 

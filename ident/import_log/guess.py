@@ -58,7 +58,10 @@ class Known:
 
 @dataclass(frozen=True)
 class Guess:
-    """A guessed mapping. rows : quantity, place, unit and reason of each signal; unused : other fields."""
+    """A guessed mapping. rows : quantity, place, unit and reason of each signal; unused : other fields.
+
+    A velocity among the unused ones is followed by the reason.
+    """
 
     HEAD: ClassVar[str] = "# Guessed from the names in "
 
@@ -108,6 +111,7 @@ class _Guesser:
             self.fields = self._blocks(self.fields[0])
         self.rows: list[tuple[str, str, str, str]] = []
         self.used: set[str] = set()
+        self.reasons: dict[str, str] = {}
 
     def guess(self) -> Guess:
         position = self._best("position")
@@ -132,14 +136,14 @@ class _Guesser:
         bad = np.flatnonzero(~np.isfinite(position.values).all(axis=1))
         if len(bad):
             raise DataError(
-                f"{self.source}: {position.shown} has missing values in {len(bad)} rows, first in row {bad[0]}; "
+                f"{self.source}: {position.shown} has missing values in {_rows(len(bad))}, first in row {bad[0]}; "
                 "write a mapping file and leave them out with `lwr-run import --rows`"
             )
         unit, reason = self._angle_unit(position, joints)
         if self.known.joints and picked is not whole:
             rests = self._rests(whole, joints, unit)
         angle = position.values * (math.pi / 180.0 if unit == "deg" else 1.0)
-        velocity = self._best("velocity", joints)
+        velocity = self._finite(self._best("velocity", joints))
         time, period = self._time(angle, velocity, unit)
         signals: dict[str, Any] = {"position": self._take("position", position, unit, reason)}
         if velocity is not None and (rate := _rate_unit(angle, velocity.values, period)) is not None:
@@ -147,6 +151,8 @@ class _Guesser:
             signals["velocity"] = self._take(
                 "velocity", velocity, name, f"{factor:.2f} times dq/dt in this unit"
             )
+        elif velocity is not None:
+            self.reasons[velocity.name] = "not dq/dt of the positions in any unit"
         signals |= self._torques(joints)
         self.rows.append(("joints", _span(joints), "", why))
         gear = any(signal.before_gear for signal in signals.values())
@@ -163,8 +169,22 @@ class _Guesser:
         )
         order = ("time", "position", "velocity", "joint_torque", "motor_torque", "joints", "held")
         self.rows.sort(key=lambda row: order.index(row[0]))
-        unused = tuple(one.shown for one in self.fields if one.name not in self.used)
+        unused = tuple(
+            f"{one.shown} ({self.reasons[one.name]})" if one.name in self.reasons else one.shown
+            for one in self.fields
+            if one.name not in self.used
+        )
         return Guess(self.source, mapping, tuple(self.rows), unused)
+
+    def _finite(self, velocity: Field | None) -> Field | None:
+        """The velocity without missing values, or None with the reason noted."""
+        if velocity is None:
+            return None
+        bad = np.flatnonzero(~np.isfinite(velocity.values).all(axis=1))
+        if not len(bad):
+            return velocity
+        self.reasons[velocity.name] = f"missing values in {_rows(len(bad))}, first in row {bad[0]}"
+        return None
 
     def _name_columns(self, count: int) -> None:
         """Call the columns of every field with `count` of them by the joints of the arm."""
@@ -397,6 +417,10 @@ class _Guesser:
             else []
         )
         return [*times, *found, replace(parts[0], name="torque")]
+
+
+def _rows(count: int) -> str:
+    return "1 row" if count == 1 else f"{count} rows"
 
 
 def _span(names: Sequence[str]) -> str:

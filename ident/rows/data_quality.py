@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,17 @@ _FLAT, _OVER_NEXT = 10, 10
 _MOVING_RAD_S = 0.01
 # Least duration of held torques over the usual time between two values.
 _HELD = 5.0
+# A frozen channel: least samples, least time [s], least length over the usual time between two values.
+_FEWEST, _FROZEN_S = 5, 0.05
+# Least speed of the jump behind a frozen position over the speed afterwards, and over the largest usual change of speed
+# (its quantile). A step of an encoder of 12 bits [rad] is no jump. Least speed before a halt over that change: a brake
+# needs several samples for it, a frozen position none.
+_JUMP, _NEARLY_ALL, _STEP_RAD, _HALT = 2.0, 0.999, 2.0 * np.pi / 4096.0, 10.0
+# A frozen torque: least length over nearly all (the quantile) of its other runs of one value, and least share of the
+# samples at that value in one run. A dead zone or a coarse sensor comes back to its values again and again.
+_LONGER, _NEARLY, _ONE_RUN = 20.0, 0.99, 0.8
+# Least way of a joint in two seconds, or speed for a shorter time, to be in motion [rad or m].
+_WAY, _WAY_S = 0.05, 2.0
 # Share of the power above a quarter of the sampling rate without any sensor's noise: a 17-bit converter makes more.
 _SILENT = 1e-10
 # Halvings of an interval of shares, for a millionth.
@@ -72,6 +84,15 @@ class Stuck:
     value: float
     count: int
     samples: int
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """A joint (from 0) with one value from the sample `first` to the sample `last` while it moves."""
+
+    joint: int
+    first: int
+    last: int
 
 
 def sample_loss(sessions: list[Session]) -> tuple[SampleLoss, ...]:
@@ -133,6 +154,94 @@ def held(effort: Floats, times: Floats, path_times: Floats, path: Floats) -> Fla
     for a, b in zip(first[speed > _MOVING_RAD_S], after[speed > _MOVING_RAD_S], strict=True):
         found[a:b] = True
     return found
+
+
+def frozen_positions(columns: JointColumns) -> tuple[Frozen, ...]:
+    """Positions at one value for long that end by a jump, or begin by a halt in one sample while other joints move.
+
+    A joint that leaves a rest gains speed from one sample to the next. After a jump it is slower than in the jump.
+    """
+    clock = columns.publish_time if np.ptp(columns.publish_time) > 0 else columns.log_time
+    times = (clock - clock[:1]) * 1e-9
+    step = np.diff(times)
+    step = np.maximum(step, max(float(np.median(step)), 1e-9)) if len(step) else step
+    found = []
+    for joint in range(columns.position.shape[1]):
+        values = column(columns.position, joint)
+        bounds = run_bounds(values)
+        first, last = bounds[:-1], bounds[1:] - 1
+        if len(first) < 3:
+            continue
+        count = last - first + 1
+        long = (count >= max(_FEWEST, _HELD * float(np.median(count)))) & (
+            times[last] - times[first] >= _FROZEN_S
+        )
+        way = np.diff(values)
+        speed = way / step
+        coarse = max(_STEP_RAD, _STEPS * float(np.abs(way[last[:-1]]).min()))
+        jumps = long[:-1] & (np.abs(way[last[:-1]]) > coarse)
+        # The change of speed at a halt, and those before and behind a jump, are not usual ones.
+        usual = np.ones(len(speed) - 1, dtype=bool)
+        places = (first[long] - 1, last[:-1][jumps] - 1, last[:-1][jumps])
+        usual[np.clip(np.concatenate(places), 0, len(usual) - 1)] = False
+        change = np.abs(np.diff(speed))
+        limit = float(np.quantile(change[usual], _NEARLY_ALL)) if usual.any() else np.inf
+        for k in np.flatnonzero(long):
+            start, end = int(first[k]), int(last[k])
+            jumped = halted = False
+            if k < len(jumps) and jumps[k]:
+                after = float(np.max(np.abs(speed[end + 1 : end + 1 + _FEWEST]), initial=0.0))
+                jumped = abs(speed[end]) > _JUMP * max(limit, after)
+            if start > 0 and abs(speed[start - 1]) > _HALT * limit:
+                span = times[end] - times[start]
+                others = np.ptp(np.delete(columns.position[start : end + 1], joint, axis=1), axis=0)
+                halted = bool(np.any(others > _WAY * min(span / _WAY_S, 1.0)))
+            if jumped or halted:
+                found.append(Frozen(joint, start, end))
+    return tuple(found)
+
+
+def frozen_torques(effort: Floats, times: Floats, path_times: Floats, path: Floats) -> tuple[Frozen, ...]:
+    """Torques (N, J) of single joints at one value for far longer than usual while the joint moves.
+
+    times : (N,) [s]. path : (P, J) positions [rad] at path_times (P,). All joints at once: `held`.
+    """
+    found = []
+    for joint in range(effort.shape[1]):
+        values = column(effort, joint)
+        bounds = run_bounds(values)
+        count = np.diff(bounds)
+        if len(count) < 3:
+            continue
+        least = max(float(_FEWEST), _LONGER * float(np.quantile(count, _NEARLY)))
+        for k in np.flatnonzero(count > least):
+            first, last = int(bounds[k]), int(bounds[k + 1]) - 1
+            duration = times[last] - times[first]
+            inside = values.min() < values[first] < values.max()
+            if duration < _FROZEN_S or not inside or count[k] <= _ONE_RUN * np.sum(values == values[first]):
+                continue
+            others = np.delete(effort[first : last + 1], joint, axis=1)
+            if others.shape[1] and not np.any(np.ptp(others, axis=0) > 0.0):
+                continue
+            low, high = np.searchsorted(path_times, [times[first], times[last]])
+            way = np.ptp(path[low : high + 1, joint]) if high > low else 0.0
+            if way > _WAY * min(duration / _WAY_S, 1.0):
+                found.append(Frozen(joint, first, last))
+    return tuple(found)
+
+
+def frozen_flags(frozen: Iterable[Frozen], shape: tuple[int, ...]) -> Flags:
+    """The samples (N, J) of frozen channels but the first of each, the last one measured."""
+    flags = np.zeros(shape, dtype=bool)
+    for one in frozen:
+        flags[one.first + 1 : one.last + 1, one.joint] = True
+    return flags
+
+
+def run_bounds(values: Floats) -> NDArray[np.int64]:
+    """First samples of the runs of one value in (N,) values, and N."""
+    edges = np.flatnonzero(values[1:] != values[:-1]) + 1
+    return np.concatenate([[0], edges, [len(values)]]).astype(np.int64)
 
 
 def clipped_at(columns: JointColumns) -> Floats:

@@ -209,6 +209,11 @@ def thinning(period_s: float, cutoff_hz: float) -> int:
     return max(1, int(1.0 / (40.0 * cutoff_hz * period_s))) if period_s > 0.0 else 1
 
 
+def enough(count: int, period_s: float, cutoff_hz: float) -> bool:
+    """Whether samples make two means of `thinning`, the fewest with a time between them; fewer fill no row's filter."""
+    return count >= 2 * thinning(period_s, cutoff_hz)
+
+
 def median_step(times: Floats) -> float:
     """Median time between samples [s], NaN for less than two."""
     return float(np.median(np.diff(times))) if len(times) > 1 else float("nan")
@@ -243,10 +248,14 @@ class ParallelFilter:
 
     @cached_property
     def sample_weights(self) -> Floats:
-        """Time represented by each sample (m,) [s], capped so that the ends of a gap do not dominate."""
+        """Time represented by each sample (m,) [s], capped so that the ends of a gap do not dominate.
+
+        A single sample tells no time between samples, and represents none.
+        """
         step = np.diff(self.times)
-        typical = float(np.median(step)) if len(step) else 1.0
-        step = np.minimum(step, 2.0 * typical)
+        if not len(step):
+            return np.zeros(len(self.times))
+        step = np.minimum(step, 2.0 * float(np.median(step)))
         return 0.5 * (np.append(step, step[-1:]) + np.append(step[:1], step))
 
     def apply(self, values: Floats) -> Floats:

@@ -28,6 +28,7 @@ from ident.rows.filters import (
     ParallelFilter,
     block_means,
     differentiate,
+    enough,
     interpolate_uniform,
     low_pass,
     settling,
@@ -175,6 +176,8 @@ def _side(
         channel, valid = passage.motor, passage.motor_valid
         if side == "difference":
             channel, valid = _difference(passage.joint, channel), valid & passage.joint_valid
+            if not enough(len(channel.times), channel.period_s, session.settings.decimate):
+                return None
     else:
         return None
     matrix, target = _filtered(channel, passage.rows, side, structure, payload, columns, session)

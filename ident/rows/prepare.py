@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import DriveMotion
-from ident.rows.data_quality import held, stale
+from ident.rows.data_quality import frozen_flags, frozen_positions, frozen_torques, held, stale
 from ident.rows.delay import DELAY_DB, DELAY_HZ, Delay, DelayData, estimate_delay
 from ident.rows.filters import (
     Excitation,
@@ -28,6 +28,7 @@ from ident.rows.filters import (
     advice,
     block_means,
     differentiate,
+    enough,
     half_width,
     interpolate_uniform,
     low_pass,
@@ -217,7 +218,8 @@ def prepare(
     position_flags, crowded = outliers(position, settings.outlier_scale)
     effort_flags, also = outliers(effort, settings.outlier_scale)
     kept = held(effort, times, times, position) if sensed else np.zeros(len(times), dtype=bool)
-    effort_flags = effort_flags | kept[:, None]
+    stuck = frozen_flags(frozen_torques(effort, times, times, position) if sensed else (), effort.shape)
+    effort_flags = effort_flags | kept[:, None] | stuck
     warnings += _jumping(name, "position", session.joint_names, crowded)
     warnings += _jumping(name, "joint torque", session.joint_names, also)
     names = moving(position, session.joint_names)
@@ -227,7 +229,8 @@ def prepare(
             "not show inertia and friction"
         )
     old = stale(session.joint) if clock is None else clock.repeated
-    bad: BoolArray = np.asarray(position_flags.any(axis=1)) | old
+    unseen = frozen_flags(frozen_positions(session.joint), position.shape).any(axis=1)
+    bad: BoolArray = np.asarray(position_flags.any(axis=1)) | old | unseen
     parts, lost = stretches(times, (position, effort), bad, dt, settings.longest_bridge_s)
     if not parts:
         raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
@@ -243,11 +246,13 @@ def prepare(
     flagged = {
         "stale": int(old.sum()),
         "position_outliers": int(position_flags.sum()),
-        "joint_torque_outliers": int(effort_flags[~kept].sum()),
+        "joint_torque_outliers": int((effort_flags & ~stuck)[~kept].sum()),
         "joint_torque_held": int(kept.sum()),
+        "joint_torque_frozen": int(stuck.sum()),
+        "position_frozen": int(unseen.sum()),
     }
     # A tenth of a gigabyte for an hour.
-    del parts, longest, position_flags, effort_flags, old, kept, bad, times
+    del parts, longest, position_flags, effort_flags, old, kept, stuck, unseen, bad, times
     motor_data = (
         _motor(session, origin, settings, name, warnings, outliers)
         if motor and session.motor is not None
@@ -449,6 +454,8 @@ class _Motion:
         period = median_step(actual[low:high])
         # Samples averaged before a low-pass are the same in all blocks.
         together = thinning(period, settings.decimate)
+        if not enough(high - low, period, settings.decimate):
+            return None
         if self.core[0] > -np.inf:
             since = int(np.searchsorted(actual, self.first)) - low
             low += max(-(-since // together), 0) * together
@@ -582,6 +589,8 @@ def _passages(
             continue
         rows = grid[inside]
         joint = motion.channel(settings)
+        if not enough(len(joint.times), joint.period_s, settings.decimate):
+            continue
         motor = motor_valid = None
         if motor_data is not None and delay is not None:
             motor = motion.motor_channel(*motor_data, delay.seconds, settings)
@@ -631,7 +640,9 @@ def _motor(
     flags, crowded = outliers(effort, settings.outlier_scale)
     warnings += _jumping(name, "motor torque", session.joint_names, crowded)
     path_times = np.asarray((reference - origin) * 1e-9, dtype=np.float64)
-    flags = flags | held(effort, times, path_times, session.joint.position)[:, None]
+    path = session.joint.position
+    flags = flags | held(effort, times, path_times, path)[:, None]
+    flags |= frozen_flags(frozen_torques(effort, times, path_times, path), effort.shape)
     effort = effort.copy() if flags.any() else effort
     for joint in np.flatnonzero(flags.any(axis=0)):
         good = ~flags[:, joint]

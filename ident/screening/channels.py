@@ -11,9 +11,20 @@ from numpy.typing import NDArray
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
-from ident.rows.data_quality import clipped_at, stuck_at
+from ident.rows.content import content
+from ident.rows.data_quality import (
+    Frozen,
+    clipped_at,
+    frozen_positions,
+    frozen_torques,
+    held,
+    run_bounds,
+    stuck_at,
+)
+from ident.rows.shared_rows import SAME_ROWS, row_numbers, shared
 from ident.screening.doubts import Doubt
 from lwr_driver.session import JointColumns, Session
+from lwr_driver.session.spool import column
 
 # Sampling rates of robot logs [Hz], and the least duration for a comparison of two clocks [s].
 _RATES, _LONG_S = (10.0, 20_000.0), 2.0
@@ -32,17 +43,15 @@ _CORNERS, _TOP, _SHARP, _LAG_S = 2, 5, 2.0, 0.02
 _STEP_RAD = 2.0 * np.pi / 4096.0
 # Share of the motion at one torque, wherever it is.
 _OFTEN = 0.05
-# A frozen channel: least length over nearly all (the quantile) of its other runs of one value, and least share of the
-# samples at that value in one run. A dead zone or a coarse sensor comes back to its values again and again.
-_LONGER, _NEARLY, _ONE_RUN = 20.0, 0.99, 0.8
-# Share of the rows of two logs equal to the last bit.
-_SAME_ROWS = 0.2
+# Least time [s] of torques kept in all joints at once to be told; shorter ones are usual in a network.
+_TOGETHER_S = 0.1
 
 
 def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts about the channels of sessions with the joints of `chain`."""
     found = [*_repeated(sessions), *_never_moving(sessions), *_dead(sessions)]
     for session in sessions:
+        found += _copied(session)
         frozen = list(_frozen(session))
         named = {(doubt.channel, doubt.joints) for doubt in frozen}
         clipped = [doubt for doubt in _clipped(session) if (doubt.channel, doubt.joints) not in named]
@@ -93,12 +102,13 @@ def _torques(session: Session) -> Iterator[tuple[str, JointColumns]]:
 
 
 def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
+    numbers = {id(session): row_numbers(session) for session in sessions} if len(sessions) > 1 else {}
     for a, b in combinations(sessions, 2):
-        share = _shared_rows(a, b)
+        share = shared(numbers[id(a)], numbers[id(b)])
         uid = a.metadata.get("uid", "")
         alike = f" and the uid {uid}" if uid and uid == b.metadata.get("uid", "") else ""
         names = f"{a.path.name} and {b.path.name}"
-        if share > _SAME_ROWS:
+        if share > SAME_ROWS:
             seen = f"{names} hold the same samples ({100 * share:.0f} %){alike}"
             yield Doubt(
                 "log", (), seen, "one log given twice", "give each log once; a copy is no new data", True
@@ -108,32 +118,6 @@ def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
             seen = f"{names} hold different samples{alike}"
             advice = "leave one out if it was made from the other; two recordings may stay"
             yield Doubt("log", (), seen, "one log processed into another", advice, False)
-
-
-def _shared_rows(a: Session, b: Session) -> float:
-    """Share of the rows of the shorter log found in the other to the last bit, in motion."""
-    one, two = (np.unique(_row_hashes(session)) for session in (a, b))
-    fewer = min(len(one), len(two))
-    return len(np.intersect1d(one, two, assume_unique=True)) / fewer if fewer else 0.0
-
-
-def _row_hashes(session: Session) -> NDArray[np.uint64]:
-    """A number of 64 bits for each row in motion, equal for rows equal to the last bit."""
-    sides = [session.joint.position, session.joint.effort]
-    if session.motor is not None and not session.joint.effort.size:
-        sides = [session.motor.effort]
-    count = len(sides[0])
-    found, moving = np.zeros(count, dtype=np.uint64), np.ones(count, dtype=bool)
-    moving[:1] = False
-    for values in sides:
-        for column in values.T:
-            # The finaliser of splitmix64 (Steele, Lea and Flood, 2014).
-            bits = np.ascontiguousarray(column).view(np.uint64) ^ (found * np.uint64(0x9E3779B97F4A7C15))
-            bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-            bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-            found = bits ^ (bits >> np.uint64(31))
-            moving[1:] &= column[1:] != column[:-1]
-    return found[moving] if moving.sum() > 100 else found
 
 
 def _never_moving(sessions: Sequence[Session]) -> Iterator[Doubt]:
@@ -243,61 +227,109 @@ def _dead(sessions: Sequence[Session]) -> Iterator[Doubt]:
                 )
 
 
+def _copied(session: Session) -> Iterator[Doubt]:
+    """Torques of several joints equal to the last bit in every sample, as two sensors never are."""
+    for channel, columns in _torques(session):
+        silent = set(dead(columns))
+        alike: dict[bytes, list[int]] = {}
+        for joint in range(columns.effort.shape[1]):
+            if joint not in silent:
+                alike.setdefault(content(column(columns.effort, joint)), []).append(joint)
+        for joints in alike.values():
+            if len(joints) > 1:
+                names = tuple(session.joint_names[joint] for joint in joints)
+                seen = "read the same to the last bit in every sample"
+                looks = "one column taken for several joints"
+                mend = "give each joint its own column when importing"
+                yield Doubt(channel, names, seen, looks, mend, True, session.path.name)
+
+
 def _frozen(session: Session) -> Iterator[Doubt]:
-    """Channels of single joints that stop in the middle of a motion. All joints at once: lost samples."""
-    name, joint = session.path.name, session.joint
-    for channel, columns, values in [
-        *((channel, columns, columns.effort) for channel, columns in _torques(session)),
-        ("position", joint, joint.position),
-    ]:
-        for k in range(values.shape[1]):
-            first, last = _longest_run(values[:, k])
-            stamps = columns.log_time[[first, last]]
-            span = (joint.log_time >= stamps[0]) & (joint.log_time <= stamps[1])
-            if (stamps[1] - stamps[0]) * 1e-9 < _LONG_S or not span.any():
-                continue
-            others = np.delete(values[first : last + 1], k, axis=1)
-            if others.shape[1] and not np.any(
-                np.ptp(others, axis=0) > (_MOVED if channel == "position" else 0.0)
-            ):
-                continue
-            if channel == "position":
-                stopped = _driven(session, k, stamps) or _abrupt(joint, k, first, last)
-            else:
-                stopped = np.ptp(joint.position[span, k]) > _MOVED and _once(values[:, k], first, last)
-            if not stopped or last - first + 1 == len(values):
-                continue
-            start, end = (stamps - joint.log_time[0]) * 1e-9
-            seen = f"reads {values[first, k]:.4g} from {start:.1f} to {end:.1f} s, in the middle of a motion"
-            mend = "cut that part off the log, or repair the channel"
-            certain = last - first > _OFTEN * len(values)
-            yield Doubt(
-                channel,
-                (session.joint_names[k],),
-                seen,
-                "a frozen channel",
-                mend,
-                certain,
-                name,
-                lost=channel != "position",
-            )
+    """Channels that stop in the middle of a motion."""
+    joint = session.joint
+    path_times = np.asarray((joint.log_time - joint.log_time[:1]) * 1e-9, dtype=np.float64)
+    for channel, columns in _torques(session):
+        times = np.asarray((columns.log_time - joint.log_time[:1]) * 1e-9, dtype=np.float64)
+        effort = columns.effort
+        runs = frozen_torques(effort, times, path_times, joint.position)
+        yield from _stopped(session, channel, times, effort, runs)
+        kept = np.flatnonzero(np.diff(held(effort, times, path_times, joint.position), prepend=0, append=0))
+        together = [(int(a) - 1, int(b) - 1) for a, b in kept.reshape(-1, 2)]
+        long = [(a, b) for a, b in together if times[b] - times[a] >= _TOGETHER_S]
+        if long:
+            seen, share = _spans(times, long), sum(b - a for a, b in long) / len(times)
+            mend = "these samples are left out; look for what held the recording up"
+            seen = f"every joint keeps its value {seen}, while the arm moves"
+            yield Doubt(channel, (), seen, "lost samples", mend, share > _OFTEN, session.path.name)
+    runs = frozen_positions(joint)
+    yield from _stopped(session, "position", path_times, joint.position, runs)
+    jumping = {run.joint for run in runs}
+    rest = [run for k, run in enumerate(_standing(session)) if run is not None and k not in jumping]
+    for run in rest:
+        yield from _stopped(session, "position", path_times, joint.position, (run,), kept=True)
 
 
-def _longest_run(values: Floats) -> tuple[int, int]:
-    """First and last sample of the longest run of one value."""
-    edges = np.flatnonzero(np.diff(values) != 0.0) + 1
-    bounds = np.concatenate([[0], edges, [len(values)]])
-    longest = int(np.argmax(np.diff(bounds)))
-    return int(bounds[longest]), int(bounds[longest + 1]) - 1
+def _stopped(
+    session: Session,
+    channel: str,
+    times: Floats,
+    values: Floats,
+    runs: Sequence[Frozen],
+    *,
+    kept: bool = False,
+) -> Iterator[Doubt]:
+    """Doubts about frozen channels; joints that freeze at the same times share one. kept : in the rows."""
+    together: dict[tuple[tuple[int, int], ...], list[int]] = {}
+    for joint in dict.fromkeys(run.joint for run in runs):
+        spans = tuple((run.first, run.last) for run in runs if run.joint == joint)
+        together.setdefault(spans, []).append(joint)
+    for spans, joints in together.items():
+        share = sum(last - first for first, last in spans) / len(times)
+        longest = max(spans, key=lambda span: span[1] - span[0])
+        alone = len(joints) == 1
+        value = f"reads {values[longest[0], joints[0]]:.4g}" if alone else "keep their values"
+        certain = kept or share > _OFTEN
+        mend = "cut that part off the log, or repair the channel"
+        yield Doubt(
+            channel,
+            tuple(session.joint_names[joint] for joint in joints),
+            f"{value} {_spans(times, spans)}, in the middle of a motion",
+            "a frozen channel" if alone else "lost samples, or frozen channels",
+            mend if certain else "these samples are left out; repair the channel",
+            certain,
+            session.path.name,
+            lost=channel != "position" and certain,
+        )
 
 
-def _once(values: Floats, first: int, last: int) -> bool:
-    """Whether a run is far longer than others, inside the range, and nearly all there is of its value."""
-    lengths = np.diff(np.concatenate([[0], np.flatnonzero(np.diff(values) != 0.0) + 1, [len(values)]]))
-    count = last - first + 1
-    usual = float(np.quantile(lengths, _NEARLY)) if len(lengths) > 2 else np.inf
-    inside = values.min() < values[first] < values.max()
-    return bool(inside and count > _LONGER * usual and count > _ONE_RUN * np.sum(values == values[first]))
+def _spans(times: Floats, spans: Sequence[tuple[int, int]]) -> str:
+    """The longest of some spans of samples in words, and how many there are."""
+    first, last = max(spans, key=lambda span: times[span[1]] - times[span[0]])
+    start, end = times[[first, last]]
+    places = 1 if end - start >= _LONG_S else 2
+    text = f"from {start:.{places}f} to {end:.{places}f} s ({end - start:.{places}f} s)"
+    if len(spans) > 1:
+        total = sum(times[b] - times[a] for a, b in spans)
+        text += f" and {len(spans) - 1} more times, {total:.{places}f} s in all"
+    return text
+
+
+def _standing(session: Session) -> Iterator[Frozen | None]:
+    """By joint, its longest standstill, if it was to move then, or stopped or left at speed, while others moved."""
+    joint = session.joint
+    for k, values in enumerate(joint.position.T):
+        bounds = run_bounds(values)
+        longest = int(np.argmax(np.diff(bounds)))
+        first, last = int(bounds[longest]), int(bounds[longest + 1]) - 1
+        stamps = joint.log_time[[first, last]]
+        others = np.delete(joint.position[first : last + 1], k, axis=1)
+        found = (
+            (stamps[1] - stamps[0]) * 1e-9 >= _LONG_S
+            and last - first + 1 < len(values)
+            and bool(not others.shape[1] or np.any(np.ptp(others, axis=0) > _MOVED))
+            and (_driven(session, k, stamps) or _abrupt(joint, k, first, last))
+        )
+        yield Frozen(k, first, last) if found else None
 
 
 def _driven(session: Session, joint: int, stamps: NDArray[np.int64]) -> bool:

@@ -157,7 +157,7 @@ def command(
     folder = results if results is not None else Path() if out is None else out.parent
     status = StatusLine()
     logs = read_recordings((*sessions, *test), urdf=urdf, folder=folder, base=base, tip=tip, **known)
-    logs = announced(logs, payload)
+    logs = announced(logs, payload, (*sessions, *test))
     if not wanted.couplings:
         wanted = replace(wanted, couplings=couplings(recorded_couplings(logs)))
     logs, tested = logs[: len(sessions)], logs[len(sessions) :]

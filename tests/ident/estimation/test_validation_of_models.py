@@ -99,6 +99,37 @@ def test_a_session_that_the_estimate_has_seen_is_refused_or_labelled(
     assert not validate(other, [unloaded], settings=PLAIN).scores[0].seen
 
 
+def test_a_copy_of_a_session_of_the_estimate_is_no_held_out_one(bench: Any, unloaded: Any) -> None:
+    model = identify([unloaded], bench.chain, IdentificationSettings(signals=PLAIN, essential=None)).model
+
+    def later(session: Any) -> Any:
+        """The samples under another name, a hundred seconds later."""
+        shifted = {
+            channel: replace(
+                columns,
+                log_time=columns.log_time + 10**11,
+                publish_time=columns.publish_time + 10**11,
+            )
+            for channel, columns in (("joint", session.joint), ("motor", session.motor))
+        }
+        phases = tuple(phase._replace(log_time=phase.log_time + 10**11) for phase in session.phases)
+        metadata = {**session.metadata, "uid": "uid-copy"}
+        return replace(
+            session, path=session.path.with_name("copy.mcap"), metadata=metadata, phases=phases, **shifted
+        )
+
+    copy = later(unloaded)
+    with pytest.raises(DataError, match=r"copy\.mcap: the model was fitted to this session or a copy of it"):
+        validate(model, [copy])
+    assert validate(model, [copy], allow_seen=True).scores[0].seen
+    other = later(bench.session("other", seed=7, periods=2))
+    assert not validate(model, [other]).scores[0].seen
+    # A model file of an earlier version holds no marks.
+    entries = [{k: v for k, v in entry.items() if k != "rows"} for entry in model.provenance["sessions"]]
+    older = replace(model, provenance={**model.provenance, "sessions": entries})
+    assert not validate(older, [copy]).scores[0].seen
+
+
 def test_an_unknown_payload_is_refused(truth_model: Any, bench: Any) -> None:
     session = bench.session("strange", seed=3)
     strange = replace(session, metadata={**session.metadata, "payload": "gripper"})

@@ -253,3 +253,52 @@ def test_a_joint_in_a_name_is_found_whole() -> None:
     assert split_name("joint_10_pos", ["joint_1", "joint_10"]) == ("_pos", "joint_10")
     assert split_name("q12", ["joint_1"]) == ("q", "12")
     assert split_name("PANDA_JOINT1.effort", JOINTS) == (".effort", "panda_joint1")
+
+
+@pytest.mark.parametrize(
+    ("pattern", "unit"),
+    [
+        ("tau{k}_mNm", "mNm"),
+        ("tau_{k} [mNm]", "mNm"),
+        ("tau_mNm_{k}", "mNm"),
+        ("torque{k}(mN.m)", "mNm"),
+        ("tau{k}_Nmm", "mNm"),
+        ("effort_mnm_{k}", "mNm"),
+        ("tau{k}_Nm", "Nm"),
+        ("TauNm{k}", "Nm"),
+        ("tau{k}", "Nm"),
+    ],
+)
+def test_the_unit_of_a_torque_is_read_from_its_name(
+    pattern: str, unit: str, arm: Path, tmp_path: Path
+) -> None:
+    size = 1e3 if unit == "mNm" else 1.0
+    names = ["t", *columns("q{k}"), *columns(pattern)]
+    path = write(tmp_path / "run.csv", names, T, Q, TAU * size)
+    guess = guess_mapping(path, arm)
+    assert guess.mapping.joint_torque is not None
+    assert guess.mapping.joint_torque.unit == unit
+    np.testing.assert_allclose(session(guess, path, tmp_path).joint.effort, TAU, rtol=1e-9)
+
+
+def test_small_currents_in_milliamperes_are_known_by_their_name(arm: Path, tmp_path: Path) -> None:
+    for pattern, unit in (("current_{k} [mA]", "mA"), ("current_{k} [A]", "A"), ("gammA_current_{k}", "A")):
+        names = ["t", *columns("q{k}"), *columns(pattern)]
+        path = write(tmp_path / "run.csv", names, T, Q, TAU)
+        guess = guess_mapping(path, arm, Known(torque_constant=(0.1,), gear_ratio=(100.0,)))
+        assert guess.mapping.motor_torque is not None
+        assert guess.mapping.motor_torque.unit == unit
+
+
+def test_a_velocity_left_out_is_followed_by_the_reason(arm: Path, tmp_path: Path) -> None:
+    names = ["t", *columns("q{k}"), *columns("dq{k}"), *columns("tau{k}")]
+    holed = QD.copy()
+    holed[17, 3] = np.nan
+    for rate, reason in (
+        (holed, "missing values in 1 row, first in row 17"),
+        (QD[::-1], "not dq/dt of the positions in any unit"),
+    ):
+        guess = guess_mapping(write(tmp_path / "run.csv", names, T, Q, rate, TAU), arm)
+        assert guess.mapping.velocity is None
+        assert guess.unused == (f"dq1 ... dq7 ({reason})",)
+        assert f"not used: dq1 ... dq7 ({reason})" in str(guess)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from ident.dynamics.structure import DriveMotion
+from ident.dynamics.structure import DriveMotion, ModelStructure
 from ident.rows import observation
 from ident.rows.binned import _add_means, bins
 from ident.rows.delay import Delay, DelayData, estimate_delay
@@ -410,3 +410,30 @@ def test_a_commanded_motion_without_error_is_the_measured_one() -> None:
     (measured,), (sent,) = prepared.passages, motion.passages
     for name in ("q", "qd", "qdd"):
         np.testing.assert_allclose(getattr(sent.joint, name), getattr(measured.joint, name), atol=1e-6)
+
+
+@pytest.mark.parametrize("extra", range(9))
+def test_a_stretch_of_a_few_samples_between_gaps_gives_no_row_and_no_error(extra: int) -> None:
+    session = arm.session(period_s=4.0, sensors=arm.Sensors(joint=0.1, motor=0.1))
+    cut = round(SignalSettings().settled(1.0 / session.joint.period_s).edge / session.joint.period_s)
+    # Around t = 8.2 s, a time of a row; the gaps are longer than any bridge.
+    first = round(8.2 / session.joint.period_s) - cut - extra // 2
+    last = first + 2 * cut + extra
+    kept = np.ones(len(session.joint), dtype=bool)
+    kept[first - 20 : first] = kept[last : last + 20] = False
+    fields = ("log_time", "publish_time", "sequence", "position", "velocity", "effort")
+    joint = replace(session.joint, **{name: getattr(session.joint, name)[kept] for name in fields})
+    holed = replace(session, joint=joint)
+    prepared = prepare(holed, advise=False)
+    assert prepared.counts["stretches"] == 3
+    inside = (8.0, 8.4)
+    for passage in prepared.passages:
+        near = (passage.rows > inside[0]) & (passage.rows < inside[1])
+        assert not passage.joint_valid[near].any()
+    for model in (1, 2, 3):
+        structure = ModelStructure(arm.chain(), model)
+        rows = observation.observe([prepared], [None], structure)
+        assert rows.groups
+        assert all(
+            np.isfinite(group.matrix).all() and np.isfinite(group.target).all() for group in rows.groups
+        )

@@ -147,7 +147,8 @@ def test_samples_at_a_gap_and_at_the_ends_count_for_their_time_alone():
     np.testing.assert_allclose(
         ParallelFilter(times, times, 1.0).sample_weights, [0.5, 0.5, 0.5, 0.75, 0.75, 0.5]
     )
-    assert ParallelFilter(times[:1], times, 1.0).sample_weights.tolist() == []
+    assert ParallelFilter(times[:1], times, 1.0).sample_weights.tolist() == [0.0]
+    assert ParallelFilter(times[:0], times, 1.0).sample_weights.tolist() == []
 
 
 def test_irregular_and_regular_times_have_the_same_filter():

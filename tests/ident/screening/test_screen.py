@@ -165,6 +165,23 @@ def test_channels_that_contradict_themselves_are_named(pair: list[Session]) -> N
     assert check_channels(with_speed()(pair), chain()) == []
 
 
+@pytest.mark.parametrize("side", ["joint", "motor"])
+def test_a_torque_that_is_a_copy_of_another_joints_is_an_error(pair: list[Session], side: str) -> None:
+    columns = getattr(pair[1], side)
+    effort = columns.effort.copy()
+    effort[:, 4] = effort[:, 2]
+    copied = replace(pair[1], **{side: replace(columns, effort=effort)})
+    (found,) = screen([pair[0], copied], chain())
+    assert (found.channel, found.joints, found.session) == (f"{side} torque", ("E1", "A4"), "loaded.mcap")
+    assert found.certain
+    # Two dead sensors are no copies, nor are torques equal but for one sample.
+    effort[17, 4] += 1e-9
+    assert screen([pair[0], replace(pair[1], **{side: replace(columns, effort=effort)})], chain()) != (found,)
+    effort[:, [2, 4]] = 0.0
+    silent = check_channels([replace(pair[1], **{side: replace(columns, effort=effort)})], chain())
+    assert {doubt.looks_like for doubt in silent} == {"a dead sensor"}
+
+
 @pytest.mark.parametrize(
     ("channel", "field", "name"),
     [
@@ -189,20 +206,127 @@ def test_a_channel_frozen_in_the_middle_of_a_motion_is_named(
         assert found.lost == (field == "effort")
 
 
-def held(session: Session, joint: int, seconds: float) -> Session:
-    """The joint torque of a joint keeps its value for some seconds from t = 8 s on."""
-    effort = session.joint.effort.copy()
-    first = round(8.0 / session.joint.period_s)
-    effort[first : first + round(seconds / session.joint.period_s) + 1, joint] = effort[first, joint]
-    return replace(session, joint=replace(session.joint, effort=effort))
+def stopped(
+    session: Session, channel: str, field: str, joints: list[int], *spans: tuple[float, float]
+) -> Session:
+    """The channel of some joints (from 0) keeps its value in each span: its start and length [s]."""
+    columns = getattr(session, channel)
+    values = getattr(columns, field).copy()
+    seconds = (columns.log_time - session.joint.log_time[0]) * 1e-9
+    for start, length in spans:
+        at = np.flatnonzero((seconds >= start - 1e-6) & (seconds <= start + length + 1e-6))
+        values[np.ix_(at, joints)] = values[at[0], joints]
+    return replace(session, **{channel: replace(columns, **{field: values})})
 
 
-@pytest.mark.parametrize(("seconds", "certain"), [(1.9, False), (2.1, True), (1.0, False)])
+@pytest.mark.parametrize(
+    ("seconds", "certain"), [(0.02, None), (0.2, False), (1.0, False), (1.9, True), (2.1, True)]
+)
 def test_a_short_freeze_is_a_warning_and_a_moment_is_none(
-    pair: list[Session], seconds: float, certain: bool
+    pair: list[Session], seconds: float, certain: bool | None
 ) -> None:
-    found = check_channels([held(pair[0], 1, seconds)], chain())
-    assert [doubt.certain for doubt in found] == ([certain] if seconds > 2.0 else [])
+    for field in ("effort", "position"):
+        one = replace(stopped(pair[0], "joint", field, [1], (8.0, seconds)), command=None)
+        found = check_channels([one], chain())
+        assert [doubt.certain for doubt in found] == ([] if certain is None else [certain])
+        for doubt in found:
+            assert doubt.joints == ("A2",)
+            assert "from 8.0" in doubt.seen
+            assert f"({seconds:.{1 if seconds > 2.0 else 2}f} s), in the middle of a motion" in doubt.seen
+            assert ("these samples are left out" in doubt.mend) != certain
+
+
+def test_short_freezes_are_named_together(pair: list[Session]) -> None:
+    spans = [(float(start), 0.2) for start in range(4, 22, 4)]
+    (found,) = check_channels([stopped(pair[0], "joint", "effort", [1], *spans)], chain())
+    assert (found.channel, found.joints, found.certain) == ("joint torque", ("A2",), False)
+    assert "(0.20 s) and 4 more times, 1.00 s in all" in found.seen
+    everywhere = list(range(7))
+    (found,) = check_channels([stopped(pair[0], "joint", "position", everywhere, (8.0, 0.5))], chain())
+    assert (found.channel, found.joints, found.certain) == ("position", chain().joint_names, False)
+    assert "keep their values from 8.00 to 8.50 s (0.50 s)" in found.seen
+    for side in ("joint", "motor"):
+        (found,) = check_channels([stopped(pair[0], side, "effort", everywhere, (8.0, 1.0))], chain())
+        assert (found.channel, found.joints, found.certain) == (f"{side} torque", (), False)
+        assert "every joint keeps its value" in found.seen
+
+
+def test_samples_of_a_short_freeze_have_no_part_in_the_rows(pair: list[Session]) -> None:
+    from ident.rows.prepare import prepare
+
+    whole = replace(pair[0], command=None)
+    for field, count in (("position", "position_frozen"), ("effort", "joint_torque_frozen")):
+        one = stopped(whole, "joint", field, [1], (10.0, 0.4))
+        prepared, before = prepare(one, advise=False), prepare(whole, advise=False)
+        assert (prepared.counts[count], before.counts[count]) == (100, 0)
+        assert prepared.counts["stretches"] == (2 if field == "position" else 1)
+        for passage in prepared.passages:
+            known = passage.joint.known[(passage.joint.times > 10.0) & (passage.joint.times < 10.4)]
+            assert not known[:, 1].any()
+            # The other torques are good where the positions are.
+            assert known[:, 0].any() == (field == "effort")
+        reach = [np.abs(passage.joint.qdd).max() for passage in (*prepared.passages, *before.passages)]
+        assert max(reach) < 1.1 * reach[-1]
+    motor = prepare(stopped(whole, "motor", "effort", [1], (10.0, 1.0)), advise=False).passages[0].motor
+    assert motor is not None
+    assert not motor.known[(motor.times > 10.05) & (motor.times < 10.95), 1].any()
+
+
+def test_a_position_that_halts_at_once_while_others_move_is_frozen(pair: list[Session]) -> None:
+    """The joint comes back to where it froze, or stays frozen until the end; a brake is no frozen position."""
+    whole = replace(pair[0], command=None)
+    position, period = whole.joint.position, whole.joint.period_s
+    count = len(position)
+    speed = np.abs(position[50:] - position[:-50]) / (50 * period)
+    joint = 2
+    first = int(np.argmax(speed[: count // 2, joint])) + 25
+    back = (
+        first
+        + 75
+        + int(np.argmin(np.abs(position[first + 75 : first + 500, joint] - position[first, joint])))
+    )
+    assert np.ptp(position[first:back, joint]) > 0.3
+    assert abs(position[back, joint] - position[first, joint]) < 0.005
+    for last in (back, count):
+        still = position.copy()
+        still[first:last, joint] = still[first, joint]
+        frozen_log = replace(whole, joint=replace(whole.joint, position=still))
+        found = [d for d in check_channels([frozen_log], chain()) if d.channel == "position"]
+        assert [(d.joints, d.looks_like) for d in found] == [(("E1",), "a frozen channel")]
+    # Speed falls to nothing in a tenth of a second, and rises again as fast.
+    time = np.arange(count) * period
+    rate = np.gradient(position[:, joint], period)
+    rate *= np.clip(np.abs(time - time[first] - 0.5) / 0.1 - 4.0, 0.0, 1.0)
+    braked = position.copy()
+    braked[:, joint] = np.cumsum(rate) * period
+    assert check_channels([replace(whole, joint=replace(whole.joint, position=braked))], chain()) == []
+
+
+def test_positions_that_no_jump_follows_are_not_frozen(pair: list[Session]) -> None:
+    whole = replace(pair[0], command=None)
+    columns, position = whole.joint, whole.joint.position
+
+    def jumps(position: np.ndarray, **times: np.ndarray) -> list[Doubt]:
+        joint = replace(columns, position=position, **times)  # type: ignore[arg-type]
+        return [d for d in check_channels([replace(whole, joint=joint)], chain()) if d.channel == "position"]
+
+    count = len(position)
+    # An encoder of 9 bits, a channel ten times slower than its stamps, samples repeated by a network.
+    grain = 2.0 * np.pi / 512.0
+    assert jumps(np.round(position / grain) * grain) == []
+    assert jumps(position[np.arange(count) // 10 * 10]) == []
+    repeated = np.random.default_rng(3).random(count) < 0.1
+    assert jumps(position[np.maximum.accumulate(np.where(repeated, 0, np.arange(count)))]) == []
+    # Stop and go, with a rest of half a second in each of two seconds.
+    time = np.arange(count) * columns.period_s
+    phase = np.clip((time % 2.0) / 1.5, 0.0, 1.0)
+    go = (phase**3 * (10.0 - 15.0 * phase + 6.0 * phase**2)) * np.where(time // 2.0 % 2.0, -1.0, 1.0)
+    go += np.where(time // 2.0 % 2.0, 1.0, 0.0)
+    assert jumps(np.tile(go[:, None], 7)) == []
+    # A recording that paused while the arm went elsewhere.
+    paused = np.where(time[:, None] < 10.0, position[0], position)
+    late = columns.log_time + np.where(time < 10.0, 0, 20_000_000_000)
+    assert jumps(paused, log_time=late, publish_time=late) == []
 
 
 def test_dead_zones_coarse_sensors_and_resting_joints_are_not_frozen(pair: list[Session]) -> None:

@@ -12,11 +12,13 @@ import pytest
 from click.testing import CliRunner, Result
 from mcap_ros2.writer import Writer
 
+from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
 from ident.model.model_file import read_model
 from lwr_driver.session import read_session
 from lwr_driver.session.messages import JOINT_STATE
 from runner.cli import main
+from runner.estimation import announced
 from tests.ident.stock_panda import JOINTS, stock_panda
 
 RATE, SECONDS = 100.0, 16.0
@@ -104,6 +106,19 @@ def test_one_command_from_a_table_to_a_report(first: Result, lab: Path) -> None:
     }  # fmt: skip
     assert read_model(lab / "first/model.yaml").structure.chain.joint_names == JOINTS
     assert error_of(lab / "first/model.yaml") < 0.1
+
+
+def test_a_payload_is_named_by_the_file_as_typed_or_as_imported(first: Result, lab: Path) -> None:
+    logs = [read_session(lab / f"first/{name}.mcap", status=False) for name in ("one", "two")]
+    typed = (lab / "one.csv", lab / "two.csv")
+    for name in ("two.csv", lab / "two.csv", "two.mcap", lab / "first/two.mcap"):
+        found = announced(logs, [f"{name}=block:1.5"], typed)
+        assert [log.metadata.get("payload") for log in found] == [logs[0].metadata.get("payload"), "block"]
+        assert found[1].metadata["payload_mass"] == "1.5"
+    with pytest.raises(ConfigurationError, match=r"with one of the files one\.csv, two\.csv"):
+        announced(logs, ["three.csv=block"], typed)
+    with pytest.raises(ConfigurationError, match=r"with one of the files one\.mcap, two\.mcap"):
+        announced(logs, ["two.csv=block"])
 
 
 def test_the_written_mapping_repeats_the_import(first: Result, lab: Path) -> None:
