@@ -14,8 +14,9 @@ from ident.diagnosis.noise import noise_floor, repeatability
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal, NominalArm, structure_of
 from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import Reference, joint_of, symbol_of
-from ident.diagnosis.selection import Selection, gain_rows
+from ident.diagnosis.selection import Selection
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.diagnosis.tolerances import gain_rows
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling, Side
 from ident.effects import DELAYS, ELASTICITY, Shape

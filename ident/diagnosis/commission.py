@@ -28,8 +28,9 @@ from ident.diagnosis.nominal import GAIN_STD, Nominal, NominalArm
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
 from ident.diagnosis.reference import DELAY_STD_S, USUAL_CHANGES, USUAL_DAYS, Reference, habit, shared
-from ident.diagnosis.selection import gain_rows, gains, select
+from ident.diagnosis.selection import gains, select
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.diagnosis.tolerances import gain_rows
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
 from ident.effects.motion import dahl

@@ -29,8 +29,8 @@ from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.refit import left_by, refitted
 from ident.diagnosis.result import Diagnosis, Finding, Nameless, RowStates, Unexplained
-from ident.diagnosis.selection import GAIN
 from ident.diagnosis.task import Baseline, State, Task
+from ident.diagnosis.tolerances import GAIN
 from ident.diagnosis.wear import is_level, wear
 from ident.effects import EFFECTS, SENSOR_GAIN, entry_of
 from ident.model import DynamicModel

@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,8 +18,7 @@ from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.effects import DELAYS, ELASTICITY, PRESLIDING, SENSOR_GAIN, Column, Shape
-from ident.effects.motion import ArmMotion
+from ident.diagnosis.tolerances import Tolerance, tolerances
 from ident.estimators.estimate import normal_tail
 
 log = logging.getLogger(__name__)
@@ -42,28 +40,15 @@ _HABIT = "habit"
 _LEAST_HABIT, _NEAR, _MOST_HABITS = 100.0, 0.5, 4
 # Least gain of `best_candidate`.
 _LEAST_GAIN = 10.0
-# Factor on the tolerance for a whole channel's delay with a known healthy delay.
-_KNOWN_DELAY = 0.4
-# The same for a stiffness behind published motors.
-_KNOWN_COMPLIANCE = 0.4
-# Largest gain error of a torque sensor as one of other days, in their standard deviations.
-_HABITUAL = 3.0
 # Confidence in a sensor's error with a record of the joint torque only.
 _SHAPE_ALONE = 0.7
 # Confidence in one of two causes of the same torque in these motions.
 _EITHER = 0.5
 # Latest sets of columns whose best shapes are kept.
 _LATEST = 6
-
 # Least and largest ratio of the information to that of the healthy sets: less of it makes no limit smaller, for what
 # the model lacks differs from motion to motion, too.
 _INFORMATION = (1.0, 25.0)
-
-# Standard deviation of a presliding length from day to day, as a share of it.
-LENGTH_STD = 0.2
-
-GAIN = "gain"
-"""Name of the tolerated deviation of a torque sensor's gain, before the number of its joint."""
 
 Null = Mapping[tuple[str, int], float]
 """Upper limit of each candidate's gain in a healthy set."""
@@ -136,35 +121,6 @@ def select(
     return Selection(claims, state.nuisance, first, state.nuisance_rows)
 
 
-def gain_rows(dictionary: Dictionary) -> dict[int, Rows]:
-    """Rows of an error of the torque sensor's gain, by joint from 0, where the sensor shows anything."""
-    mask = dictionary.evidence.mask
-    joints = [j for side, j in mask if side == "joint" and mask[side, j].any()]
-    found = {j: dictionary.rows(Candidate(SENSOR_GAIN, j), Shape()) for j in joints}
-    return {j: rows for j, rows in found.items() if rows}
-
-
-def presliding_rows(dictionary: Dictionary) -> dict[int, Rows]:
-    """Rows of a change of the drives' presliding length, in shares of it, by joint from 0, where the arm has one."""
-    nominal = dictionary.nominal
-    lengths = nominal.arm.presliding
-    if lengths is None or "motor" not in nominal.rows:
-        return {}
-    found: dict[int, Rows] = {}
-    for joint in np.flatnonzero((lengths > 0.0) & nominal.moving).tolist():
-        near = [
-            Shape(length=float(lengths[joint]) * factor) for factor in (1.0 + LENGTH_STD, 1.0 - LENGTH_STD)
-        ]
-
-        def made(motion: ArmMotion, joint: int = joint, near: Sequence[Shape] = tuple(near)) -> list[Column]:
-            scale = float(motion.motor_coulomb[joint]) / (2.0 * LENGTH_STD)
-            longer, shorter = (np.asarray(PRESLIDING.columns(motion, joint, one)[0].motor) for one in near)
-            return [Column(motor=scale * (longer - shorter))]
-
-        found[joint] = {("motor", joint): nominal.columns(made, ["motor"])["motor"][0][:, None]}
-    return found
-
-
 def gains(
     dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings
 ) -> dict[tuple[str, int], float]:
@@ -220,16 +176,6 @@ def _gain(trial: Trial) -> float:
     return trial.score.gain - 2.0 * trial.shape.freedom
 
 
-class _Tolerance(NamedTuple):
-    """A tolerated deviation: name, rows, unit of the coefficient, largest size, and the candidate with these rows."""
-
-    name: str
-    rows: Rows
-    unit: float
-    size: float
-    of: tuple[str, int] | None = None
-
-
 @dataclass(eq=False)
 class State:
     """What is accepted and tolerated so far, and the candidates beside it."""
@@ -241,76 +187,22 @@ class State:
     shown: Shown = field(default_factory=dict)
     nuisance: dict[str, tuple[float, float]] = field(default_factory=dict)
     nuisance_rows: list[Rows] = field(default_factory=list)
-    _tolerances: list[_Tolerance] | None = None
+    _tolerances: list[Tolerance] | None = None
     _latest: dict[tuple[int, ...], list[Trial]] = field(default_factory=dict)
 
     # ---- tolerated deviations ----
 
-    def tolerances(self) -> list[_Tolerance]:
+    def tolerated(self) -> list[Tolerance]:
         """The tolerated deviations."""
-        if self._tolerances is not None:
-            return self._tolerances
-        nominal, found = self.dictionary.nominal, list[_Tolerance]()
-        limit = self.settings.delay_tolerance_s
-        for side in nominal.rows:
-            rows = self.dictionary.rows(Candidate(DELAYS[side], -1), Shape(delay=1e-3))
-            if side == "motor":
-                found.append(_Tolerance("motor delay", rows, 1e-3, limit, (DELAYS[side].cause, -1)))
-            else:
-                found += self._joint_delays(rows, limit)
-        if "motor" in nominal.rows and np.any(nominal.arm.compliance > 0.0):
-            # Behind published motors the links' ringing shows the stiffness, known from the healthy arm.
-            known = nominal.arm.encoder == "motor" and nominal.arm.encoder_known
-            share = self.settings.compliance_tolerance * (_KNOWN_COMPLIANCE if known else 1.0)
-            shape = ELASTICITY.at_encoder(nominal.arm.encoder)
-            for joint in range(nominal.arm.chain.n):
-                rows = self.dictionary.rows(Candidate(ELASTICITY, joint), shape)
-                if rows:
-                    size = share * float(nominal.arm.compliance[joint])
-                    found.append(
-                        _Tolerance(f"compliance {joint + 1}", rows, 1.0, size, (ELASTICITY.cause, joint))
-                    )
-        if self.evidence.compared:
-            # Without a reference the gains of the sensors are hardly distinguishable from a scale of all masses.
-            size = _HABITUAL * nominal.arm.gain_std
-            found += [
-                _Tolerance(f"{GAIN} {j + 1}", rows, 1.0, size, (SENSOR_GAIN.cause, j))
-                for j, rows in gain_rows(self.dictionary).items()
-            ]
-            found += [
-                _Tolerance(f"presliding {j + 1}", rows, 1.0, _HABITUAL * LENGTH_STD, (PRESLIDING.cause, j))
-                for j, rows in presliding_rows(self.dictionary).items()
-            ]
-        self._tolerances = found
-        return found
-
-    def _joint_delays(self, rows: Rows, limit: float) -> list[_Tolerance]:
-        """Tolerated delays of the torque sensors: a common one, and the difference of each from it.
-
-        Each sensor has electronics of its own and a delay of its own. The delay of the whole channel is their mean,
-        weighted by the information in the rows. Seven sensors determine it much better than one, so with a known
-        healthy delay a smaller one is a finding.
-        """
-        evidence, keys = self.evidence, sorted(rows)
-        known = self.dictionary.nominal.arm.encoder_known
-        weight = {
-            key: float(np.sum(part**2)) / float(evidence.sigma[key[0]][key[1]] ** 2)
-            for key, part in evidence.padded(rows).items()
-        }
-        best = max(keys, key=lambda key: weight[key])
-        common = (_KNOWN_DELAY if known else 2.0) * limit
-        found = [_Tolerance("joint delay", rows, 1e-3, common, (DELAYS["joint"].cause, -1))]
-        for key in keys:
-            if key != best and weight[best] > 0.0:
-                apart = {key: rows[key], best: -weight[key] / weight[best] * rows[best]}
-                found.append(_Tolerance(f"delay of joint {key[1] + 1} apart", apart, 1e-3, 2.0 * limit))
-        return found
+        if self._tolerances is None:
+            self._tolerances = tolerances(self.dictionary, self.evidence, self.settings)
+        return self._tolerances
 
     def tolerate(self, accepted: Sequence[Trial]) -> None:
         """Base with the accepted columns and the deviations within their tolerance, but for those of an accepted
         cause: of two equal columns each would take a half."""
         taken = {t.candidate.key for t in accepted}
-        entries = [one for one in self.tolerances() if one.of not in taken]
+        entries = [one for one in self.tolerated() if one.of not in taken]
         fixed = [t.rows for t in accepted]
         place = self.evidence.base_count + sum(_width(rows) for rows in fixed)
         inside = entries
@@ -383,14 +275,14 @@ class State:
     def habit(self, found: Sequence[Trial]) -> bool:
         """Tolerates the best candidate of a gain as on healthy days, near that of the best one of all; whether there is
         one. A change from day to day that is not in the model would pass for other causes."""
-        known = [one for one in self.tolerances() if one.name.startswith(_HABIT)]
+        known = [one for one in self.tolerated() if one.name.startswith(_HABIT)]
         near = [t for t in found if t.score.gain > max(_LEAST_HABIT, _NEAR * found[0].score.gain)]
         for trial in near if len(known) < _MOST_HABITS else ():
             single = len(trial.score.coefficients) == 1 and not trial.candidate.effect.event
             if single and not self.carried(trial) and self.carried(trial, healthy=False):
                 log.info("%s: gain %.0f, as on healthy days", trial.candidate.key, trial.score.gain)
                 name = f"{_HABIT} {len(known) + 1}: {trial.candidate.cause} {trial.candidate.joint + 1}"
-                self.tolerances().append(_Tolerance(name, trial.rows, 1.0, np.inf, trial.candidate.key))
+                self.tolerated().append(Tolerance(name, trial.rows, 1.0, np.inf, trial.candidate.key))
                 return True
         return False
 

@@ -23,7 +23,8 @@ from ident.diagnosis.held_out import HeldOut
 from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
 from ident.diagnosis.result import Evident, Finding, Value
-from ident.diagnosis.selection import Claim, gain_rows
+from ident.diagnosis.selection import Claim
+from ident.diagnosis.tolerances import gain_rows
 from ident.effects import FRICTION_TEMPERATURE, WEAR
 from ident.effects.course import Course
 from ident.estimators.estimate import fisher_tail

@@ -209,7 +209,7 @@ def test_habits_of_healthy_days_are_tolerated_beside_every_cause(chain: Chain) -
     found = sorted(trials.values(), key=lambda t: -t.score.gain)
     # Several coefficients are a shape of their own; one is a size that changes from day to day.
     assert state.habit(found)
-    assert [one.of for one in state.tolerances()] == [("stribeck", 0)]
+    assert [one.of for one in state.tolerated()] == [("stribeck", 0)]
     assert not state.habit([trials["gear_ripple"]])
     assert not state.habit([trials["cable_spring"]])
     usual["cable_spring"] = True

@@ -1,0 +1,125 @@
+"""Deviations of the nominal arm that are no finding: columns of the base beside every cause.
+
+Delays of a millisecond, joint stiffness, and, against a reference, what differs from day to day: the gains of the
+torque sensors and the presliding lengths of the drives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ident.diagnosis.candidates import Candidate, Dictionary
+from ident.diagnosis.evidence import Evidence, Rows
+from ident.diagnosis.settings import DiagnosisSettings
+from ident.effects import DELAYS, ELASTICITY, PRESLIDING, SENSOR_GAIN, Column, Shape
+from ident.effects.motion import ArmMotion
+
+# Factor on the tolerance for a whole channel's delay with a known healthy delay.
+_KNOWN_DELAY = 0.4
+# The same for a stiffness behind published motors.
+_KNOWN_COMPLIANCE = 0.4
+# Largest change from day to day, in standard deviations.
+_HABITUAL = 3.0
+# Standard deviation of a presliding length from day to day, as a share of it.
+_LENGTH_STD = 0.2
+
+GAIN = "gain"
+"""Name of the tolerated deviation of a torque sensor's gain, before the number of its joint."""
+
+
+class Tolerance(NamedTuple):
+    """A tolerated deviation: name, rows, unit of the coefficient, largest size, and the candidate with these rows."""
+
+    name: str
+    rows: Rows
+    unit: float
+    size: float
+    of: tuple[str, int] | None = None
+
+
+def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings) -> list[Tolerance]:
+    """The tolerated deviations of an arm in the rows of a dictionary."""
+    nominal, found = dictionary.nominal, list[Tolerance]()
+    limit = settings.delay_tolerance_s
+    for side in nominal.rows:
+        rows = dictionary.rows(Candidate(DELAYS[side], -1), Shape(delay=1e-3))
+        if side == "motor":
+            found.append(Tolerance("motor delay", rows, 1e-3, limit, (DELAYS[side].cause, -1)))
+        else:
+            found += _joint_delays(dictionary, evidence, rows, limit)
+    if "motor" in nominal.rows and np.any(nominal.arm.compliance > 0.0):
+        # Behind published motors the links' ringing shows the stiffness, known from the healthy arm.
+        known = nominal.arm.encoder == "motor" and nominal.arm.encoder_known
+        share = settings.compliance_tolerance * (_KNOWN_COMPLIANCE if known else 1.0)
+        shape = ELASTICITY.at_encoder(nominal.arm.encoder)
+        for joint in range(nominal.arm.chain.n):
+            rows = dictionary.rows(Candidate(ELASTICITY, joint), shape)
+            if rows:
+                size = share * float(nominal.arm.compliance[joint])
+                found.append(Tolerance(f"compliance {joint + 1}", rows, 1.0, size, (ELASTICITY.cause, joint)))
+    if evidence.compared:
+        # Without a reference the gains of the sensors are hardly distinguishable from a scale of all masses.
+        size = _HABITUAL * nominal.arm.gain_std
+        found += [
+            Tolerance(f"{GAIN} {j + 1}", rows, 1.0, size, (SENSOR_GAIN.cause, j))
+            for j, rows in gain_rows(dictionary).items()
+        ]
+        found += [
+            Tolerance(f"presliding {j + 1}", rows, 1.0, _HABITUAL * _LENGTH_STD, (PRESLIDING.cause, j))
+            for j, rows in _presliding_rows(dictionary).items()
+        ]
+    return found
+
+
+def _joint_delays(dictionary: Dictionary, evidence: Evidence, rows: Rows, limit: float) -> list[Tolerance]:
+    """Tolerated delays of the torque sensors: a common one, and the difference of each from it.
+
+    Each sensor has electronics of its own and a delay of its own. The delay of the whole channel is their mean,
+    weighted by the information in the rows. Seven sensors determine it much better than one, so with a known
+    healthy delay a smaller one is a finding.
+    """
+    keys, known = sorted(rows), dictionary.nominal.arm.encoder_known
+    weight = {
+        key: float(np.sum(part**2)) / float(evidence.sigma[key[0]][key[1]] ** 2)
+        for key, part in evidence.padded(rows).items()
+    }
+    best = max(keys, key=lambda key: weight[key])
+    common = (_KNOWN_DELAY if known else 2.0) * limit
+    found = [Tolerance("joint delay", rows, 1e-3, common, (DELAYS["joint"].cause, -1))]
+    for key in keys:
+        if key != best and weight[best] > 0.0:
+            apart = {key: rows[key], best: -weight[key] / weight[best] * rows[best]}
+            found.append(Tolerance(f"delay of joint {key[1] + 1} apart", apart, 1e-3, 2.0 * limit))
+    return found
+
+
+def gain_rows(dictionary: Dictionary) -> dict[int, Rows]:
+    """Rows of an error of the torque sensor's gain, by joint from 0, where the sensor shows anything."""
+    mask = dictionary.evidence.mask
+    joints = [j for side, j in mask if side == "joint" and mask[side, j].any()]
+    found = {j: dictionary.rows(Candidate(SENSOR_GAIN, j), Shape()) for j in joints}
+    return {j: rows for j, rows in found.items() if rows}
+
+
+def _presliding_rows(dictionary: Dictionary) -> dict[int, Rows]:
+    """Rows of a change of the drives' presliding length, in shares of it, by joint from 0, where the arm has one."""
+    nominal = dictionary.nominal
+    lengths = nominal.arm.presliding
+    if lengths is None or "motor" not in nominal.rows:
+        return {}
+    found: dict[int, Rows] = {}
+    for joint in np.flatnonzero((lengths > 0.0) & nominal.moving).tolist():
+        near = [
+            Shape(length=float(lengths[joint]) * factor) for factor in (1.0 + _LENGTH_STD, 1.0 - _LENGTH_STD)
+        ]
+
+        def made(motion: ArmMotion, joint: int = joint, near: Sequence[Shape] = tuple(near)) -> list[Column]:
+            scale = float(motion.motor_coulomb[joint]) / (2.0 * _LENGTH_STD)
+            longer, shorter = (np.asarray(PRESLIDING.columns(motion, joint, one)[0].motor) for one in near)
+            return [Column(motor=scale * (longer - shorter))]
+
+        found[joint] = {("motor", joint): nominal.columns(made, ["motor"])["motor"][0][:, None]}
+    return found
