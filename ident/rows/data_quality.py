@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from ident.rows.content import Kept
 from lwr_driver.session import JointColumns, Session
 from lwr_driver.session.spool import column, spans
 
@@ -39,6 +40,8 @@ _JUMP, _NEARLY_ALL, _STEP_RAD, _HALT = 2.0, 0.999, 2.0 * np.pi / 4096.0, 10.0
 # A frozen torque: least length over nearly all (the quantile) of its other runs of one value, and least share of the
 # samples at that value in one run. A dead zone or a coarse sensor comes back to its values again and again.
 _LONGER, _NEARLY, _ONE_RUN = 20.0, 0.99, 0.8
+# Latest recordings whose frozen positions are known: an estimator prepares a session several times.
+_MOST_KNOWN = 64
 # Least way of a joint in two seconds, or speed for a shorter time, to be in motion [rad or m].
 _WAY, _WAY_S = 0.05, 2.0
 # Share of the power above a quarter of the sampling rate without any sensor's noise: a 17-bit converter makes more.
@@ -162,12 +165,19 @@ def frozen_positions(columns: JointColumns) -> tuple[Frozen, ...]:
     A joint that leaves a rest gains speed from one sample to the next. After a jump it is slower than in the jump.
     """
     clock = columns.publish_time if np.ptp(columns.publish_time) > 0 else columns.log_time
-    times = (clock - clock[:1]) * 1e-9
+    return _frozen.of(_frozen_positions, (clock - clock[:1]) * 1e-9, columns.position)
+
+
+_frozen = Kept[tuple[Frozen, ...]](_MOST_KNOWN)
+
+
+def _frozen_positions(times: Floats, position: Floats) -> tuple[Frozen, ...]:
+    """`frozen_positions` of positions (N, J) [rad] at times (N,) [s]."""
     step = np.diff(times)
     step = np.maximum(step, max(float(np.median(step)), 1e-9)) if len(step) else step
     found = []
-    for joint in range(columns.position.shape[1]):
-        values = column(columns.position, joint)
+    for joint in range(position.shape[1]):
+        values = column(position, joint)
         bounds = run_bounds(values)
         first, last = bounds[:-1], bounds[1:] - 1
         if len(first) < 3:
@@ -194,7 +204,7 @@ def frozen_positions(columns: JointColumns) -> tuple[Frozen, ...]:
                 jumped = abs(speed[end]) > _JUMP * max(limit, after)
             if start > 0 and abs(speed[start - 1]) > _HALT * limit:
                 span = times[end] - times[start]
-                others = np.ptp(np.delete(columns.position[start : end + 1], joint, axis=1), axis=0)
+                others = np.ptp(np.delete(position[start : end + 1], joint, axis=1), axis=0)
                 halted = bool(np.any(others > _WAY * min(span / _WAY_S, 1.0)))
             if jumped or halted:
                 found.append(Frozen(joint, start, end))
