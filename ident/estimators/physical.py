@@ -33,6 +33,8 @@ _ROOT2 = np.sqrt(2.0)
 _REWEIGHTINGS = 8
 # The solver resolves eight digits: no class is trusted beyond 1e-5 of its torque.
 _FINEST = 1e10
+# Largest change of the constraints, in sizes of the prior's bodies, by a unit of a deviation.
+_FELT = 10.0
 # Tolerances of the conic program, the next one where the arithmetic does not reach the first.
 _TOLERANCES = (1e-10, 1e-8, 1e-6)
 
@@ -202,11 +204,14 @@ class PhysicallyConsistent:
             return best
         rows, offset, cones = self._constraints()
         left = offset - rows @ best
+        # What nothing knows has no such unit: there it is one that the constraints feel.
+        felt = np.linalg.norm(rows @ spread, axis=0)
+        unit = np.minimum(1.0, _FELT / np.maximum(felt, 1e-300))
         try:
-            curvature = sparse.csc_matrix(np.eye(len(size)))
-            return np.asarray(
-                best + spread @ _conic(curvature, np.zeros(len(size)), rows @ spread, left, cones)
+            moved = _conic(
+                sparse.diags(unit**2, format="csc"), np.zeros(len(size)), rows @ (spread * unit), left, cones
             )
+            return np.asarray(best + (spread * unit) @ moved)
         except DataError:
             # So far from the possible that these units are of no use: each parameter in its own.
             own = np.zeros((quadratic.shape[1], len(size)))
@@ -335,7 +340,13 @@ def _conic(curvature: sparse.csc_matrix, linear: Floats, rows: Floats, offset: F
         settings.verbose = False
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
         solver = clarabel.DefaultSolver(curvature, linear, sparse.csc_matrix(rows), offset, cones, settings)
-        result = solver.solve()
+        try:
+            result = solver.solve()
+        except BaseException as error:  # the solver's panic is no Exception
+            if type(error).__name__ != "PanicException":
+                raise
+            status = "a panic of the solver"
+            continue
         status = str(result.status)
         if status in ("Solved", "AlmostSolved"):
             return np.array(result.x)
