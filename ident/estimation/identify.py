@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -19,6 +18,7 @@ from ident.dynamics.tables import Tabular
 from ident.estimation.assumptions import Assumptions, check_assumptions, weak_parameters
 from ident.estimation.essential import Essential, EssentialSettings, find_essential
 from ident.estimation.plausibility import payload_warnings, require_plausible
+from ident.estimation.session_rows import session_rows, with_delays
 from ident.estimators import ESTIMATORS
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.errors_in_variables import InstrumentalVariables
@@ -28,15 +28,14 @@ from ident.estimators.physical import cad_prior
 from ident.estimators.problem import Problem
 from ident.model.dynamic_model import DynamicModel
 from ident.model.signals import signals_entry
-from ident.rows.delay import SHIFT_S, Delay, delay_alone
 from ident.rows.filters import SignalSettings
-from ident.rows.observation import commanded, observe, stack
-from ident.rows.prepare import PreparedSession, prepare
+from ident.rows.observation import stack
+from ident.rows.prepare import PreparedSession
 from ident.rows.sessions import payload_name, require
 from ident.rows.shared_rows import marks
 from ident.rows.signal_choice import choose_signals
-from ident.rows.timebase import KnownOutliers, Outliers
-from ident.screening.screen import require_sound, without_dead
+from ident.rows.timebase import KnownOutliers
+from ident.screening.screen import require_sound
 from lwr_driver.listing import Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -44,10 +43,6 @@ if TYPE_CHECKING:
     from ident.estimation.choice import Choice
 
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
-
-logger = logging.getLogger(__name__)
-# Estimates of a delay by the base model, each at the one before, at most.
-_DELAY_STEPS = 4
 
 
 @dataclass(frozen=True)
@@ -448,12 +443,18 @@ def observed(
         settings, signals=signals.settings, coulomb=signals.coulomb, row_coulomb=signals.row_coulomb
     )
     make = partial(
-        _session_rows, settings=settings, structure=rows_structure, base=base, motor=needs_motor,
-        advise=not known.signal_reasons, outliers=outliers,
-    )  # fmt: skip
+        session_rows,
+        signals=settings.signals,
+        structure=rows_structure,
+        base=base,
+        resonance_hz=settings.resonance_hz,
+        motor=needs_motor,
+        advise=not known.signal_reasons,
+        outliers=outliers,
+    )
     # One session after the other, so that memory holds the full-rate signals of one only.
     made = [make(session, payload, log=first) for session, payload in zip(chosen, mounted, strict=True)]
-    made = _late(made, list(zip(chosen, mounted, strict=True)), settings.signals, make)
+    made = with_delays(made, list(zip(chosen, mounted, strict=True)), settings.signals, make)
     prepared, problems = [one.prepared for one in made], [one.problem for one in made]
     instruments = [one.instruments for one in made if one.instruments is not None]
     _every_joint_moves(prepared, chain)
@@ -468,114 +469,6 @@ def observed(
         sessions=tuple(chosen),
         known=known,
     )
-
-
-@dataclass(frozen=True)
-class _SessionRows:
-    """The rows of one session: prepared, without its samples; stacked; and those of its commanded motion, if any."""
-
-    prepared: PreparedSession
-    problem: Problem
-    instruments: Problem | None
-
-    @property
-    def delay_s(self) -> float:
-        """Delay of the motor torques in use [s]."""
-        return 0.0 if self.prepared.delay is None else self.prepared.delay.seconds
-
-    @property
-    def alone(self) -> bool:
-        """Whether the motor torques have no joint torques beside them that tell their delay."""
-        return (
-            self.prepared.delay is not None and not self.prepared.mean_torque and bool(self.problem.nuisances)
-        )
-
-    def late(self, delay: Delay) -> _SessionRows:
-        """The same with the delay of its motor torques as estimated."""
-        nuisances = tuple(replace(one, std=delay.std) for one in self.problem.nuisances)
-        problem = replace(self.problem, nuisances=nuisances)
-        return replace(self, prepared=replace(self.prepared, delay=delay), problem=problem)
-
-
-def _session_rows(
-    session: Session,
-    payload: str | None,
-    *,
-    settings: IdentificationSettings,
-    structure: ModelStructure,
-    base: BaseSet,
-    motor: bool,
-    log: bool,
-    advise: bool,
-    outliers: Outliers,
-    delay_s: float | None = None,
-) -> _SessionRows:
-    """The rows of one session. delay_s : of its motor torques; None for that of the settings."""
-    signals = settings.signals if delay_s is None else replace(settings.signals, motor_delay_s=delay_s)
-    whole = prepare(
-        session,
-        signals,
-        resonance_hz=settings.resonance_hz,
-        motor=motor,
-        log=log,
-        advise=advise,
-        blocks=True,
-        outliers=outliers,
-    )
-    seen = observe([whole], [payload], structure, columns=base.columns, names=base.names, units=base.units)
-    problem = without_dead(seen, session)
-    motion = None if signals.average_periods else commanded(session, whole)
-    whole_without = replace(whole.without_samples(), settings=settings.signals)
-    del whole
-    instruments = None
-    if motion is not None:
-        seen = observe([motion], [payload], structure, columns=base.columns)
-        instruments = without_dead(seen, session)
-    return _SessionRows(whole_without, problem, instruments)
-
-
-def _late(
-    made: list[_SessionRows],
-    of: Sequence[tuple[Session, str | None]],
-    signals: SignalSettings,
-    make: Callable[..., _SessionRows],
-) -> list[_SessionRows]:
-    """The rows with the delay of motor torques that have no joint torques beside them.
-
-    It comes from the base model, so from rows at the delay found so far.
-    """
-    if signals.motor_delay_s != "estimate" or not any(one.alone for one in made):
-        return made
-    found, late = list(made), [k for k, one in enumerate(made) if one.alone]
-    delays: list[Delay] = []
-    for _ in range(_DELAY_STEPS):
-        now = [found[k].delay_s for k in late]
-        shifted = []
-        for shift in (SHIFT_S, -SHIFT_S):
-            moved = [one.problem for one in found]
-            for k, delay_s in zip(late, now, strict=True):
-                moved[k] = make(*of[k], log=False, delay_s=delay_s + shift).problem
-            shifted.append(stack(moved))
-        try:
-            whole = stack([one.problem for one in found])
-            delays = delay_alone(whole, late, (shifted[0], shifted[1]), now)
-        except DataError as error:
-            logger.info("no delay of the motor torques by themselves: %s", error)
-            return found
-        for k, delay in zip(late, delays, strict=True):
-            rows = (
-                found[k]
-                if delay.seconds == found[k].delay_s
-                else make(*of[k], log=False, delay_s=delay.seconds)
-            )
-            found[k] = rows.late(delay)
-        if all(
-            abs(delay.seconds - before) < 0.3 * delay.std for delay, before in zip(delays, now, strict=True)
-        ):
-            break
-    for delay in delays:
-        logger.info("motor channel %s", delay)
-    return found
 
 
 def estimator_factory(name: str, *, prior_std: float = 0.2, **options: Any) -> EstimatorFactory:
