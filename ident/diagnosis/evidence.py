@@ -299,10 +299,7 @@ class Evidence:
             p = self.base_count
             gram[:p, :p] += self.prior[0]
             target[:p] += self.prior[0] @ self.prior[1]
-        gram *= np.outer(s, s)
-        # Keeps directions without excitation finite; 1e-9 of the diagonal decides nothing else.
-        gram[np.diag_indices_from(gram)] += 1e-9
-        inverse = np.linalg.inv(gram) * np.outer(s, s)
+        inverse = _inverse(gram, s)
         return Fit(inverse @ target, inverse)
 
     def padded(self, rows: Rows) -> dict[Key, Floats]:
@@ -380,16 +377,16 @@ class Evidence:
 
     def information(self, products: Products) -> float:
         """Mean fall of the chi-square for a unit of a group's coefficients beside the base parameters alone."""
-        cross, own = products.alone.sum(axis=0), products.own.sum(axis=0)
-        p = self.base_count
+        left = _left(products.alone.sum(axis=0), products.own.sum(axis=0), self._base_inverse)
+        return float(np.mean(np.maximum(left, 0.0)))
+
+    @cached_property
+    def _base_inverse(self) -> Floats:
+        """Inverse (p, p) of the base's products, with the prior."""
         gram = self._base_gram.sum(axis=0)
         if self.prior is not None:
             gram = gram + self.prior[0]
-        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        inner = gram / np.outer(scale, scale) + 1e-9 * np.eye(p)
-        wide = cross / scale
-        left = np.diag(own) - np.einsum("kp,pk->k", wide, np.linalg.solve(inner, wide.T))
-        return float(np.mean(np.maximum(left, 0.0)))
+        return _inverse(gram, 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300)))
 
     # ---- scores ----
 
@@ -443,9 +440,8 @@ class Evidence:
         gain = min(gain, fitted)
         if self._free is not None:
             # A cause explained by base parameters without the prior could only make up for a wrong drawing.
-            size, cross = np.diag(whole[1]), whole[0]
-            left = size - np.einsum("kp,pq,kq->k", cross, self._free.inverse, cross)
-            gain = min(gain, 0.0) if np.all(left < _OWN_SHARE * size) else gain
+            left = _left(whole[0], whole[1], self._free.inverse)
+            gain = min(gain, 0.0) if np.all(left < _OWN_SHARE * np.diag(whole[1])) else gain
         values, gram, torque = self.full.values - projection @ coefficients, self.gram, self.target
 
         def robust() -> tuple[Floats, int]:
@@ -562,6 +558,20 @@ class Evidence:
 
 def _width(rows: Rows) -> int:
     return next(iter(rows.values())).shape[1]
+
+
+def _inverse(gram: Floats, scale: Floats) -> Floats:
+    """Inverse (P, P) of products scaled to a diagonal near one."""
+    both = np.outer(scale, scale)
+    scaled = gram * both
+    # Keeps directions without excitation finite; 1e-9 of the diagonal decides nothing else.
+    scaled[np.diag_indices_from(scaled)] += 1e-9
+    return np.asarray(np.linalg.inv(scaled) * both)
+
+
+def _left(cross: Floats, own: Floats, inverse: Floats) -> Floats:
+    """Squares (k,) of columns beside others: products with those (k, P), among themselves (k, k), inverse (P, P)."""
+    return np.asarray(np.diag(own) - np.einsum("kp,pq,kq->k", cross, inverse, cross))
 
 
 def _made(columns: _Columns) -> Mapping[Key, Floats]:

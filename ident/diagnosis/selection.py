@@ -292,8 +292,10 @@ class State:
         limit = self.null.get(key, 0.0)
         shape = self.dictionary.nearest(trial)
         before = self.shown.get(key, {}).get(shape, 0.0)
+        if not limit or before <= 0.0:
+            return limit
         now = self.dictionary.information(trial.candidate).get(shape, 0.0)
-        return limit * float(np.clip(now / before, *_INFORMATION)) if before > 0.0 else limit
+        return limit * float(np.clip(now / before, *_INFORMATION))
 
     def refined(self, trial: Trial) -> Trial:
         """The trial with its shape at the best fit, unless cross-validation contradicts that shape."""

@@ -161,10 +161,9 @@ class Setting:
         (n,) whether the joint torque changes its sign for more than a moment. encoder : side of the elastic joints
         with the published positions, None if unknown. presliding : (n,) presliding length of the model [rad],
         None if unknown. standstill_rad_s : rows below this speed are left out. compared : whether the sessions are
-        compared with a reference. compliance : (n,) [rad/Nm]
-        of the springs behind published motors, None if the links' positions are published. clipped : (n,) torque
-        limit seen in the samples of a joint's sensor [Nm], NaN for none. pauses : whether the sessions follow one
-        another by their clock, with pauses.
+        compared with a reference. compliance : (n,) [rad/Nm] of the springs behind published motors, None if the
+        links' positions are published. clipped : (n,) torque limit seen in the samples of a joint's sensor [Nm], NaN
+        for none. pauses : whether the sessions follow one another by their clock, with pauses.
     """
 
     sessions: int

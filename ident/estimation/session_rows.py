@@ -66,10 +66,12 @@ def session_rows(
     advise: bool,
     outliers: Outliers,
     delay_s: float | None = None,
+    instruments: bool = True,
 ) -> SessionRows:
     """The rows of one session with the payload mounted in it.
 
-    delay_s : of its motor torques, None for that of `signals`. Others: as for `prepare` and `observe`.
+    delay_s : of its motor torques, None for that of `signals`. instruments : False leaves the commanded motion aside.
+    Others: as for `prepare` and `observe`.
     """
     used = signals if delay_s is None else replace(signals, motor_delay_s=delay_s)
     whole = prepare(
@@ -84,14 +86,13 @@ def session_rows(
     )
     seen = observe([whole], [payload], structure, columns=base.columns, names=base.names, units=base.units)
     problem = without_dead(seen, session)
-    motion = None if signals.average_periods else commanded(session, whole)
+    motion = commanded(session, whole) if instruments and not signals.average_periods else None
     bare = replace(whole.without_samples(), settings=signals)
     del whole
-    instruments = None
-    if motion is not None:
-        seen = observe([motion], [payload], structure, columns=base.columns)
-        instruments = without_dead(seen, session)
-    return SessionRows(bare, problem, instruments)
+    if motion is None:
+        return SessionRows(bare, problem, None)
+    seen = observe([motion], [payload], structure, columns=base.columns)
+    return SessionRows(bare, problem, without_dead(seen, session))
 
 
 def with_delays(
@@ -116,7 +117,7 @@ def with_delays(
         for shift in (SHIFT_S, -SHIFT_S):
             moved = [one.problem for one in found]
             for k, delay_s in zip(late, now, strict=True):
-                moved[k] = make(*of[k], log=False, delay_s=delay_s + shift).problem
+                moved[k] = make(*of[k], log=False, delay_s=delay_s + shift, instruments=False).problem
             shifted.append(stack(moved))
         try:
             whole = stack([one.problem for one in found])

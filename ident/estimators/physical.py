@@ -112,9 +112,14 @@ class BodyPrior:
         block = self.hessian(metric)[np.ix_(places, places)]
         covariance[np.ix_(places, places)] = np.linalg.inv(block)
         known = np.array([not np.any(row[~inertial]) and bool(np.any(row)) for row in self.projection])
-        mean = np.zeros(n)
-        mean[self.bodies.ravel()] = self.inertial.ravel()
-        return Prior.projected(mean, covariance, self.projection, known)
+        return Prior.projected(self.standard, covariance, self.projection, known)
+
+    @property
+    def standard(self) -> Floats:
+        """The prior's standard parameters (n,), zero for those of the drives."""
+        found = np.zeros(self.projection.shape[1])
+        found[self.bodies.ravel()] = self.inertial.ravel()
+        return found
 
 
 @dataclass(frozen=True)
@@ -194,7 +199,7 @@ class PhysicallyConsistent:
         size = np.where(size > 0.0, size, 1.0)[used]
         # A trace of curvature makes the solution unique for parameters without effect and prior.
         stacked = np.vstack([matrix[:, used] / size, 1e-10 * np.eye(len(size))])
-        wanted = np.concatenate([target, root @ self._start, np.zeros(len(size))])
+        wanted = np.concatenate([target, root @ prior.standard, np.zeros(len(size))])
         q, r = np.linalg.qr(stacked)
         # Deviations from the minimiser, in units in which they cost the same: there the solver's digits suffice.
         spread = np.zeros((quadratic.shape[1], len(size)))
@@ -218,13 +223,6 @@ class PhysicallyConsistent:
             own[used] = np.diag(1.0 / size)
             curvature = sparse.csc_matrix(np.triu(r.T @ r))
             return np.asarray(best + own @ _conic(curvature, np.zeros(len(size)), rows @ own, left, cones))
-
-    @property
-    def _start(self) -> Floats:
-        """The prior's standard parameters (n,)."""
-        start = np.zeros(self.prior.projection.shape[1])
-        start[self.prior.bodies.ravel()] = self.prior.inertial.ravel()
-        return start
 
     def _feasible(self, standard: Floats) -> bool:
         """Whether standard parameters (n,) keep all constraints."""

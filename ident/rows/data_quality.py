@@ -34,9 +34,11 @@ _HELD = 5.0
 # A frozen channel: least samples, least time [s], least length over the usual time between two values.
 _FEWEST, _FROZEN_S = 5, 0.05
 # Least speed of the jump behind a frozen position over the speed afterwards, and over the largest usual change of speed
-# (its quantile). A step of an encoder of 12 bits [rad] is no jump. Least speed before a halt over that change: a brake
-# needs several samples for it, a frozen position none.
-_JUMP, _NEARLY_ALL, _STEP_RAD, _HALT = 2.0, 0.999, 2.0 * np.pi / 4096.0, 10.0
+# (its quantile). Least speed before a halt over that change: a brake needs several samples for it, a frozen position
+# none.
+_JUMP, _NEARLY_ALL, _HALT = 2.0, 0.999, 10.0
+STEP_RAD = 2.0 * np.pi / 4096.0
+"""Step of an encoder of 12 bits [rad], no jump."""
 # A frozen torque: least length over nearly all (the quantile) of its other runs of one value, and least share of the
 # samples at that value in one run. A dead zone or a coarse sensor comes back to its values again and again.
 _LONGER, _NEARLY, _ONE_RUN = 20.0, 0.99, 0.8
@@ -188,7 +190,7 @@ def _frozen_positions(times: Floats, position: Floats) -> tuple[Frozen, ...]:
         )
         way = np.diff(values)
         speed = way / step
-        coarse = max(_STEP_RAD, _STEPS * float(np.abs(way[last[:-1]]).min()))
+        coarse = max(STEP_RAD, _STEPS * float(np.abs(way[last[:-1]]).min()))
         jumps = long[:-1] & (np.abs(way[last[:-1]]) > coarse)
         # The change of speed at a halt, and those before and behind a jump, are not usual ones.
         usual = np.ones(len(speed) - 1, dtype=bool)

@@ -46,8 +46,6 @@ _GRID = 41
 _KNOWN = 0.4
 # Rows of a joint needed for a delay of its own.
 _LEAST_ROWS = 16
-# Half the step of the derivative by the delay [s].
-_STEP_S = 1e-3
 SHIFT_S = 1e-3
 """Change of a delay for the derivative by it [s]."""
 # Largest Fvm / stiffness of strain-wave joints, 17 Nm s/rad over 8 kNm/rad: so early an elastic joint looks [s].
@@ -390,7 +388,7 @@ def _newton(
 ) -> tuple[Floats, Floats, Floats]:
     """Gauss-Newton step of the delay (1,), or of each joint's own (J,), standard deviations [s], and Fvm (J,)."""
     parts = [part.masked(delay) for part in parts]
-    here, later, earlier = ([part.at(delay + shift) for part in parts] for shift in (0.0, _STEP_S, -_STEP_S))
+    here, later, earlier = ([part.at(delay + shift) for part in parts] for shift in (0.0, SHIFT_S, -SHIFT_S))
     count = len(joints) if separate else 1
     groups = []
     # A joint moving one way only cannot tell Coulomb friction from an offset.
@@ -418,7 +416,7 @@ def _newton(
             )
             matrix = np.zeros((len(rows), width + count))
             matrix[:, first : first + len(used[j])] = here[record][0][rows, j][:, used[j]]
-            matrix[:, width + (place if separate else 0)] = -slope / (2.0 * _STEP_S)
+            matrix[:, width + (place if separate else 0)] = -slope / (2.0 * SHIFT_S)
             groups.append(RowGroup(str(j), "difference", record, matrix, here[record][1][rows, j], rows))
         first += len(used[j])
     titles = [f"{_SYMBOLS[k]} {j}" for j in joints for k in used[j]]

@@ -13,6 +13,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.rows.content import content
 from ident.rows.data_quality import (
+    STEP_RAD,
     Frozen,
     clipped_at,
     frozen_positions,
@@ -39,8 +40,6 @@ _SPEED_UNITS = {180.0 / np.pi: "deg/s for rad/s", 30.0 / np.pi: "revolutions per
 _OVER, _OUTLIERS = 1.1, 0.001
 # Corners at a flat top: least number, length of the top, way before it over the one of a usual stop, time of that way.
 _CORNERS, _TOP, _SHARP, _LAG_S = 2, 5, 2.0, 0.02
-# Steps of an encoder of 12 bits [rad], no jump.
-_STEP_RAD = 2.0 * np.pi / 4096.0
 # Share of the motion at one torque, wherever it is.
 _OFTEN = 0.05
 # Least time [s] of torques kept in all joints at once to be told; shorter ones are usual in a network.
@@ -351,7 +350,7 @@ def _abrupt(columns: JointColumns, joint: int, first: int, last: int) -> bool:
     usual = bends[(np.abs(middle - first) > 2 * lag) & (np.abs(middle - last) > 2 * lag)]
     before, after = values[max(first - lag, 0)], values[min(last + lag, len(values) - 1)]
     jump = max(abs(before - values[first]), abs(after - values[first]))
-    return bool(len(usual) and jump > max(_SHARP * float(np.quantile(usual, 1.0 - _OUTLIERS)), _STEP_RAD))
+    return bool(len(usual) and jump > max(_SHARP * float(np.quantile(usual, 1.0 - _OUTLIERS)), STEP_RAD))
 
 
 def _clipped(session: Session) -> Iterator[Doubt]:
