@@ -111,7 +111,7 @@ def select(
             break
     claims = [state.claim(accepted, k) for k in range(len(accepted))]
     while doubtful := [
-        k for k, c in enumerate(claims) if c.outdone or state.leftover(c.trial, _others(claims, k))
+        k for k, c in enumerate(claims) if c.outdone or state.leftover(c.trial, state.others(accepted, k))
     ]:
         # A better explanation of the same rows lacks evidence itself, or the claim is the remainder of another.
         accepted.pop(min(doubtful, key=lambda k: claims[k].gain))
@@ -142,10 +142,6 @@ def best_candidate(
     if best is None or best.score.gain < _LEAST_GAIN:
         return None
     return Selection([Claim(best, best.score)], state.nuisance, {}, state.nuisance_rows)
-
-
-def _others(claims: Sequence[Claim], k: int) -> list[Trial]:
-    return [claim.trial for i, claim in enumerate(claims) if i != k]
 
 
 def _same_moment(trial: Trial, other: Trial) -> bool:
@@ -461,6 +457,15 @@ class State:
         self.evidence.replace([*self.evidence.extra, *wide])
         again = self.dictionary.trial(trial.candidate, trial.shape, self.choices(trial))
         return again is None or not self.carried(again)
+
+    def others(self, accepted: Sequence[Trial], k: int) -> list[Trial]:
+        """The accepted trials without number k, each with its gain beside the rest of them: what two of almost equal
+        torque explain belongs to neither while both are in the base."""
+        found = [t for i, t in enumerate(accepted) if i != k]
+        for i, trial in enumerate(found):
+            self.beside(found, i)
+            found[i] = self.dictionary.trial(trial.candidate, trial.shape, self.choices(trial)) or trial
+        return found
 
     def claim(self, accepted: Sequence[Trial], k: int) -> Claim:
         """The accepted trial number k with its look-alikes, given all others."""

@@ -60,3 +60,28 @@ def test_best_shapes_are_found_once_beside_the_same_columns_and_anew_beside_othe
         assert [t.score.gain for t in again] == [t.score.gain for t in found]
     shared = {t.candidate.key: t.score.gain for t in alone}
     assert any(t.score.gain != shared[t.candidate.key] for t in beside if t.candidate.key in shared)
+
+
+def test_what_two_look_alikes_share_counts_for_the_other_one(
+    make: Callable[..., Session], chain: Chain
+) -> None:
+    def rough(s: dict[str, np.ndarray]) -> None:
+        v = s["qd"][:, 1]
+        s["motor"][:, 1] += 0.4 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
+
+    bench = signature_bench([make("a.mcap", 1, rough), make("b.mcap", 2, rough, 1)], chain)
+    state = State(bench.dictionary, bench.evidence, DiagnosisSettings(), {})
+    stribeck = Candidate(EFFECTS["stribeck"], 1)
+    shapes = [Shape(velocity=speed, exponent=1.0) for speed in (0.15, 0.2)]
+
+    def trials() -> list[Trial]:
+        return [t for t in (bench.dictionary.trial(stribeck, shape, 1) for shape in shapes) if t is not None]
+
+    state.tolerate([])
+    alone = trials()
+    state.tolerate(alone[1:])
+    beside = trials()[0].score.gain
+    (other,) = state.others(alone, 1)
+    assert other.shape == shapes[0]
+    assert np.isclose(other.score.gain, alone[0].score.gain)
+    assert other.score.gain > 5.0 * max(beside, 1.0)
