@@ -47,6 +47,8 @@ class SignalSettings:
     longest_bridge_s : longest gap bridged by interpolation; a longer one splits the record.
     reversal_s : samples of a joint this close to its reversal have no part in its rows, because friction turns
         there in a way that no sign function follows (presliding, stiction, a motor that reverses later).
+    slow_rad_s : samples of a joint not faster than this have no part in its rows, because friction of many drives
+        falls with the speed (Stribeck).
     standstill_rad_s : a joint below this speed rests, and its Coulomb torque is unknown.
     known_share : least share of a row's filter on samples measured and away from reversals.
     outlier_scale : distance of an outlier from the running median, in robust standard deviations.
@@ -66,6 +68,7 @@ class SignalSettings:
     edge_s: _Span | None = None
     longest_bridge_s: _Span = 0.02
     reversal_s: _Span | None = None
+    slow_rad_s: Annotated[float, within(0.0, 100.0, "rad/s")] | None = None
     standstill_rad_s: Annotated[float, within(0.0, 100.0, "rad/s")] = 2e-3
     known_share: Annotated[float, within(0.0, 1.0, "share")] = 0.4
     outlier_scale: Annotated[float, within(0.0, 1e6, above=True)] = 8.0
@@ -103,8 +106,10 @@ class SignalSettings:
         """With the figures of the paper where none is stated, as far as a channel of `rate_hz` carries them."""
         cutoff = min(CUTOFF_HZ, NYQUIST_SHARE * rate_hz) if self.cutoff_hz is None else self.cutoff_hz
         decimate = min(DECIMATE_HZ, cutoff / 1.5) if self.decimate_hz is None else self.decimate_hz
-        reversal = REVERSAL_S if self.reversal_s is None else self.reversal_s
-        return replace(self, cutoff_hz=max(cutoff, decimate), decimate_hz=decimate, reversal_s=reversal)
+        cutoff = max(cutoff, decimate)
+        return replace(
+            self, cutoff_hz=cutoff, decimate_hz=decimate, reversal_s=self.reversal, slow_rad_s=self.slow
+        )
 
     @property
     def cutoff(self) -> float:
@@ -120,6 +125,11 @@ class SignalSettings:
     def reversal(self) -> float:
         """Time left out on either side of a reversal [s]."""
         return REVERSAL_S if self.reversal_s is None else self.reversal_s
+
+    @property
+    def slow(self) -> float:
+        """Speed from which on a joint's samples are in its rows [rad/s]."""
+        return 0.0 if self.slow_rad_s is None else self.slow_rad_s
 
     @property
     def row_rate_hz(self) -> float:

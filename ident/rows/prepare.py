@@ -388,6 +388,7 @@ class _Motion:
             good = ~flagged[:, joint]
             torque[~good, joint] = np.interp(grid[~good], grid[good], torque[good, joint])
         away = away_from_reversals(qd, part.dt, settings.reversal, settings.standstill_rad_s)
+        away &= np.abs(qd) > settings.slow
         drive = None
         kept = slice(span[0] - low, span[1] - low)
         if stiffness is not None:

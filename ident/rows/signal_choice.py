@@ -10,6 +10,8 @@ model on rows at full band, in blocks of two seconds at most: the even ones are 
   jumps of the acceleration at reversals, a higher one lets noise into it.
 * The time left out beside reversals is the one with the least held-back error far from them: a shorter one lets the
   turning of friction bend the parameters, a longer one wastes samples.
+* Slow motion is left out up to the least speed above which Coulomb friction is one constant: friction that falls with
+  the speed (Stribeck) would bend the parameters.
 * The friction law of the model is the one with the least held-back error over all samples, reversals and standstill
   included. The rows of the estimation have it too if it predicts the samples far from reversals better than the sign:
   a law may follow the turning of friction and still bend the friction of a moving joint.
@@ -25,6 +27,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from ident.dynamics.parameters import Floats, split_name
 from ident.dynamics.structure import Coulomb, ModelStructure
@@ -48,9 +51,13 @@ _CUTOFFS = (2.5, 5.0, 12.5)
 _TOLERANCE = 0.005
 # Bins left out beside a reversal; the last ones are far from it.
 _WINDOWS = (0, 1, 2, 3, 4, 5, 7, 10)
+# Speeds up to which slow motion is left out [rad/s].
+_SPEEDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 _WIDTHS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 # Least fall of the held-back error for another law than the sign.
 _WORTH = 0.005
+# Chance below which slow motion has another friction.
+_OTHER = 0.005
 _RIDGE = 1e-10
 # Rows of a joint for an error of its own.
 _LEAST = 8
@@ -84,7 +91,7 @@ def choose_signals(
     payloads : mounted in each session. columns : base columns of the structure. outliers : as for `prepare`.
     """
     coulomb, row_coulomb = laws
-    given = None not in (settings.cutoff_hz, settings.decimate_hz, settings.reversal_s)
+    given = None not in (settings.cutoff_hz, settings.decimate_hz, settings.reversal_s, settings.slow_rad_s)
     if given and coulomb is not None:
         return SignalChoice(settings, coulomb, row_coulomb or coulomb)
     parts = [_excerpt(session, _MOST_S / len(sessions)) for session in sessions]
@@ -126,6 +133,8 @@ def _chosen(
     rows = bench.rows(found) if rows is None else rows
     if found.reversal_s is None:
         found = replace(found, reversal_s=_reversal_s(rows, band, found.standstill_rad_s, reasons))
+    if found.slow_rad_s is None:
+        found = replace(found, slow_rad_s=0.0 if band is not None else _slow_rad_s(rows, found, reasons))
     law, row_law = (coulomb, row_coulomb or coulomb) if coulomb else bench.laws(rows, found, reasons)
     return SignalChoice(found, law, row_law, tuple(reasons))
 
@@ -188,7 +197,7 @@ def _with_decimation(
 class _Rows:
     """Rows of one joint and side of all sessions.
 
-    measured : (m,), neither bridged nor outliers. even : (m,), of the fitted blocks. parts, stretches : the rows of all
+    measured : (m,), neither bridged nor outliers. block : (m,), number of its block. parts, stretches : the rows of all
     joints of each stretch, and their places here.
     """
 
@@ -196,9 +205,14 @@ class _Rows:
     torque: Floats
     speed: Floats
     measured: NDArray[np.bool_]
-    even: NDArray[np.bool_]
+    block: NDArray[np.int64]
     parts: tuple[BinnedRows, ...]
     stretches: tuple[slice, ...]
+
+    @property
+    def even(self) -> NDArray[np.bool_]:
+        """Rows (m,) of the fitted blocks."""
+        return np.asarray(self.block % 2 == 0)
 
     def known(self, bins: int, standstill_rad_s: float) -> NDArray[np.bool_]:
         """Measured rows (m,) more than `bins` rows from a reversal."""
@@ -235,7 +249,7 @@ class _Bench:
                 parts.setdefault(rows.side, []).append(rows)
         found = {}
         for side, some in parts.items():
-            even = np.concatenate([np.floor(rows.time / self.block_s) % 2 == 0 for rows in some])
+            block = _blocks([rows.time for rows in some], self.block_s)
             ends = np.cumsum([0, *(len(rows.time) for rows in some)]).tolist()
             stretches = tuple(slice(first, last) for first, last in pairwise(ends))
             for j in range(self.structure.chain.n):
@@ -248,7 +262,7 @@ class _Bench:
                         ),
                         np.concatenate([rows.speed[:, j] for rows in some]),
                         measured,
-                        even,
+                        block,
                         tuple(some),
                         stretches,
                     )
@@ -290,8 +304,7 @@ class _Bench:
     def laws(self, rows: _ByClass, settings: SignalSettings, reasons: list[str]) -> tuple[Coulomb, Coulomb]:
         """The friction laws of the model and of the rows."""
         still = settings.standstill_rad_s
-        left_out = round(settings.reversal / _BIN_S)
-        away = {key: own.known(left_out, still) for key, own in rows.items()}
+        away = _away(rows, settings)
         far = {key: own.known(_WINDOWS[-1], still) for key, own in rows.items()}
         everything = {key: own.measured for key, own in rows.items()}
         sign = _fit(rows, away)
@@ -333,6 +346,15 @@ class _Bench:
         return found
 
 
+def _blocks(times: Sequence[Floats], block_s: float) -> NDArray[np.int64]:
+    """Number of each row's block, of rows at the times [s] of several stretches; even blocks are even in all."""
+    first, found = 0, []
+    for time in times:
+        found.append(np.floor(time / block_s).astype(np.int64) + first)
+        first = (int(found[-1].max(initial=first)) // 2 + 1) * 2
+    return np.concatenate(found)
+
+
 def _reversal_s(rows: _ByClass, band: float | None, standstill_rad_s: float, reasons: list[str]) -> float:
     """Time left out beside reversals [s]."""
     if band is not None and band * _WINDOWS[-1] * _BIN_S < 2.0:
@@ -352,11 +374,72 @@ def _reversal_s(rows: _ByClass, band: float | None, standstill_rad_s: float, rea
     return chosen
 
 
-def _fit(rows: _ByClass, masks: _Masks) -> Floats:
-    """Weighted least squares of the masked rows in the even blocks."""
+def _slow_rad_s(rows: _ByClass, settings: SignalSettings, reasons: list[str]) -> float:
+    """Speed up to which slow motion is left out [rad/s]."""
+    faster = [_away(rows, replace(settings, slow_rad_s=speed)) for speed in _SPEEDS]
+    place = max(k for k, masks in enumerate(faster) if k == 0 or _many(masks, faster[0]))
+    chance = 1.0
+    while place > 0 and (chance := _chance(rows, faster[place - 1], faster[place])) >= _OTHER:
+        place -= 1
+    if not place:
+        reasons.append("slow motion: in the rows, its friction is that of a faster one")
+    else:
+        reasons.append(
+            f"slow motion: up to {_SPEEDS[place]:g} rad/s left out, its friction is another one (p = {chance:.1g})"
+        )
+    return _SPEEDS[place]
+
+
+def _away(rows: _ByClass, settings: SignalSettings) -> _Masks:
+    """The rows away from reversals and slow motion."""
+    bins = round(settings.reversal / _BIN_S)
+    away = {key: own.known(bins, settings.standstill_rad_s) for key, own in rows.items()}
+    return {key: mask & (np.abs(rows[key].speed) > settings.slow) for key, mask in away.items()}
+
+
+def _many(masks: _Masks, whole: _Masks) -> bool:
+    """Whether the masks have a third of the rows of every joint and side."""
+    return all(3 * masks[key].sum() >= some.sum() for key, some in whole.items())
+
+
+def _chance(rows: _ByClass, masks: _Masks, far: _Masks) -> float:
+    """Chance, if Coulomb friction is one constant, of as much of another one in the masked rows that are not `far`.
+
+    Each class has a column of the sign of its speed in those rows. The squares of the coefficients over their standard
+    deviations, of the sums in blocks, add up to a chi-square.
+    """
+    values = _fit(rows, far, whole=True)
+    power = {key: _power(own, values, far[key]) for key, own in rows.items()}
+    grams = [own.matrix[masks[key]].T @ own.matrix[masks[key]] / power[key] for key, own in rows.items()]
+    inverse = np.linalg.pinv(np.sum(grams, axis=0), hermitian=True)
+    right = [own.matrix[masks[key]].T @ own.torque[masks[key]] / power[key] for key, own in rows.items()]
+    values = inverse @ np.sum(right, axis=0)
+    squares = []
+    for key, own in rows.items():
+        used = masks[key]
+        near = (used & ~far[key])[used]
+        if near.sum() < _LEAST:
+            continue
+        column = np.sign(own.speed[used]) * near
+        matrix = own.matrix[used]
+        free = column - matrix @ (inverse @ (matrix.T @ column)) / power[key]
+        sums = np.bincount(own.block[used], free * (own.torque[used] - matrix @ values))
+        squares.append(float(np.sum(sums)) ** 2 / max(float(sums @ sums), 1e-300))
+    return float(chdtrc(len(squares), sum(squares))) if squares else 1.0
+
+
+def _power(own: _Rows, values: Floats, used: NDArray[np.bool_]) -> float:
+    """Mean square of the residual in the used rows [Nm^2], of exact rows a share of the torque's."""
+    torque = own.torque[used]
+    residual = torque - own.matrix[used] @ values
+    return (float(residual @ residual) + 1e-12 * float(torque @ torque) + 1e-300) / max(len(torque), 1)
+
+
+def _fit(rows: _ByClass, masks: _Masks, *, whole: bool = False) -> Floats:
+    """Weighted least squares of the masked rows in the even blocks, or in all."""
     grams, targets, squares, counts = [], [], [], []
     for key, own in rows.items():
-        used = masks[key] & own.even
+        used = masks[key] & (own.even | whole)
         matrix, torque = own.matrix[used], own.torque[used]
         grams.append(matrix.T @ matrix)
         targets.append(matrix.T @ torque)

@@ -307,7 +307,7 @@ def test_an_earlier_filter_over_the_widest_window_leaves_the_reversals_in() -> N
     speed = np.sin(0.2 * np.arange(count))
     rows = {
         ("joint", 0): _Rows(
-            speed[:, None], 2.0 * speed, speed, np.ones(count, dtype=bool), np.arange(count) // 50 % 2 == 0, (),
+            speed[:, None], 2.0 * speed, speed, np.ones(count, dtype=bool), np.arange(count) // 50, (),
             (slice(0, count),),
         )
     }  # fmt: skip

@@ -10,7 +10,7 @@ import pytest
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.structure import Coulomb, ModelStructure
 from ident.rows.filters import SignalSettings
-from ident.rows.signal_choice import SignalChoice, _error, _fit, _Rows, choose_signals
+from ident.rows.signal_choice import SignalChoice, _blocks, _error, _fit, _Rows, choose_signals
 from tests.ident import estimation_arm as arm
 
 
@@ -35,7 +35,7 @@ def test_every_open_figure_is_set_and_explained():
 
 
 def test_stated_figures_stay():
-    settings = SignalSettings(cutoff_hz=7.0, decimate_hz=3.0, reversal_s=0.04)
+    settings = SignalSettings(cutoff_hz=7.0, decimate_hz=3.0, reversal_s=0.04, slow_rad_s=0.03)
     law = Coulomb("tanh", 0.01)
     found = chosen(arm.session(motor=False), settings, law)
     assert (found.settings, found.coulomb, found.row_coulomb, found.reasons) == (settings, law, law, ())
@@ -121,6 +121,28 @@ def test_a_drive_that_turns_slowly_has_its_reversals_left_out():
     assert chosen(session).settings.reversal_s < late
 
 
+@pytest.mark.parametrize(
+    ("speed_rad_s", "share", "low", "high"), [(0.1, 0.5, 0.1, 0.3), (0.0, 0.0, 0.0, 0.0)]
+)
+def test_slow_motion_with_another_friction_is_left_out(
+    speed_rad_s: float, share: float, low: float, high: float
+):
+    session = arm.session(motor=False, sensors=sensors(), period_s=50.0, periods=2)
+    speed = arm.fourier(session.joint.publish_time * 1e-9 - 3.0, 50.0, 5)[1]
+    more = share * arm.drive("Fcl") * np.sign(speed) * np.exp(-np.square(speed / max(speed_rad_s, 1e-9)))
+    stribeck = dataclasses.replace(
+        session, joint=dataclasses.replace(session.joint, effort=session.joint.effort + more)
+    )
+    found = chosen(stribeck, coulomb=Coulomb())
+    assert low <= found.settings.slow_rad_s <= high
+    assert any(reason.startswith("slow motion: ") for reason in found.reasons)
+
+
+def test_blocks_are_even_in_every_stretch():
+    times = [np.array([0.0, 1.9, 2.0, 6.5]), np.array([5.0, 6.0]), np.array([0.5])]
+    np.testing.assert_array_equal(_blocks(times, 2.0), [0, 0, 1, 3, 6, 7, 8])
+
+
 def test_samples_beside_the_reversals_of_an_ideal_drive_without_noise_stay():
     found = chosen(arm.session(), coulomb=Coulomb())
     assert found.settings.reversal_s == 0.0
@@ -135,7 +157,8 @@ def test_a_long_recording_is_judged_by_a_part_of_it():
 def made(torque, matrix, even) -> _Rows:
     count = len(torque)
     whole = np.ones(count, dtype=bool)
-    return _Rows(matrix, torque, np.ones(count), whole, even, (), (slice(0, count),))
+    block = np.where(even, 0, 1)
+    return _Rows(matrix, torque, np.ones(count), whole, block, (), (slice(0, count),))
 
 
 def test_a_loud_class_has_little_weight_in_the_fit():

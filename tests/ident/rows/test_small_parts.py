@@ -66,12 +66,15 @@ def test_a_slow_joint_has_to_go_on_for_the_path_on_which_friction_turns():
 def test_unset_settings_are_those_of_the_paper_as_far_as_the_rate_carries_them():
     plain = SignalSettings()
     assert (plain.cutoff, plain.decimate, plain.reversal, plain.order) == (10.0, 2.0, 0.05, 4)
+    assert (plain.slow, plain.settled(1000.0).slow_rad_s) == (0.0, 0.0)
     assert (plain.row_rate_hz, plain.edge) == (5.0, 0.2)
     at_1khz, at_40hz, at_10hz = (plain.settled(rate) for rate in (1000.0, 40.0, 10.0))
     assert (at_1khz.cutoff_hz, at_1khz.decimate_hz, at_1khz.reversal_s) == (10.0, 2.0, 0.05)
     assert (at_40hz.cutoff_hz, at_40hz.decimate_hz) == (8.0, 2.0)
     assert (at_10hz.cutoff_hz, at_10hz.decimate_hz) == (2.0, pytest.approx(2.0 / 1.5))
-    stated = SignalSettings(cutoff_hz=4.0, decimate_hz=3.0, reversal_s=0.01, rate_hz=7.0, edge_s=0.3)
+    stated = SignalSettings(
+        cutoff_hz=4.0, decimate_hz=3.0, reversal_s=0.01, slow_rad_s=0.02, rate_hz=7.0, edge_s=0.3
+    )
     assert stated.settled(1000.0) == stated
     assert (stated.row_rate_hz, stated.edge) == (7.0, 0.3)
     assert SignalSettings(decimate_hz=30.0).settled(100.0).cutoff_hz == 30.0
