@@ -1,9 +1,10 @@
 """What to do with the samples beside reversals, where friction follows no sign function?
 
 Run `python -m benchmarks.reversals [--pairs 4] [--first-seed 700]`. Pairs of sessions of emulated arms, stiff and
-elastic, with and without friction that turns slowly after a reversal, are identified in four ways: all samples with
-sign(qd); all samples with tanh(qd / width) in the rows, the width chosen by held-back error; samples beside reversals
-left out, with that law in the rows; and left out with sign(qd) in the rows and the law in the model (as it comes).
+elastic, with and without friction that turns slowly after a reversal, and with friction that falls with the speed
+(Stribeck), are identified in five ways: all samples with sign(qd); all samples with tanh(qd / width) in the rows, the
+width chosen by held-back error; samples beside reversals left out, with that law in the rows; with sign(qd) in the
+rows and the law in the model; and slow motion left out besides (as it comes).
 """
 
 from __future__ import annotations
@@ -33,25 +34,37 @@ from tests.ident.estimation_arm import true_base
 
 _STIFF = [1.5e5, 1.5e5, 1.2e5, 1.2e5, 8e4, 6e4, 6e4]
 _TURNING = {"type": "tests.hidden_physics.arm:HiddenArm", "options": {}}
+_FALLING = {
+    "type": "tests.hidden_physics.arm:HiddenArm",
+    "options": {
+        "traits": {
+            "stribeck": dict.fromkeys(range(1, 8), 0.25),
+            "stribeck_speed": dict.fromkeys(range(1, 8), 0.1),
+        }
+    },
+}
 SCENES: dict[str, dict[str, Any]] = {
     "elastic": {},
     "stiff": {"robot.stiffness": _STIFF},
     "elastic, slow turning": {"robot.plant": _TURNING},
     "stiff, slow turning": {"robot.plant": _TURNING, "robot.stiffness": _STIFF},
+    "elastic, Stribeck": {"robot.plant": _FALLING},
 }
 _SHOWN = ("Ia", "Fvm", "Fcm")
 
 
 def ways(chosen: Identification) -> dict[str, IdentificationSettings]:
-    """The settings of the four ways, from an identification as it comes."""
+    """The settings of the five ways, from an identification as it comes."""
     settings, signals = chosen.settings, chosen.settings.signals
     assert settings.coulomb is not None
-    everything = replace(signals, reversal_s=0.0, standstill_rad_s=0.0)
+    everything = replace(signals, reversal_s=0.0, slow_rad_s=0.0, standstill_rad_s=0.0)
+    turning = replace(signals, slow_rad_s=0.0)
     return {
         "all, sign": replace(settings, signals=everything, coulomb=Coulomb(), row_coulomb=Coulomb()),
         "all, smooth": replace(settings, signals=everything, row_coulomb=settings.coulomb),
-        "left out, smooth": replace(settings, row_coulomb=settings.coulomb),
-        "left out, sign": replace(settings, row_coulomb=Coulomb()),
+        "left out, smooth": replace(settings, signals=turning, row_coulomb=settings.coulomb),
+        "left out, sign": replace(settings, signals=turning, row_coulomb=Coulomb()),
+        "as it comes": settings,
     }
 
 
