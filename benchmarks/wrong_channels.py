@@ -222,6 +222,17 @@ def without(channel: str, change: Change) -> Change:
     return whole
 
 
+def mistaken(sessions: Sessions) -> Sessions:
+    """The motor torques under the name of joint torques, which are missing."""
+
+    def efforts(session: Session) -> Any:
+        assert session.motor is not None
+        times = session.joint.publish_time, session.motor.publish_time
+        return np.column_stack([np.interp(*times, effort) for effort in session.motor.effort.T])
+
+    return [replace(s, joint=replace(s.joint, effort=efforts(s)), motor=None) for s in sessions]
+
+
 M, L, Q = ("motor", "effort"), ("joint", "effort"), ("joint", "position")
 MOTOR, JOINT, POSITION = "motor torque", "joint torque", "position"
 
@@ -290,6 +301,7 @@ CASES: tuple[Case, ...] = (
     Case("joint A4 frozen half of one log", frozen(*L, "A4", only=0), (JOINT, "A4")),
     Case("position E1 frozen half of one log", frozen(*Q, "E1", only=0), (POSITION, "E1")),
     # One torque alone.
+    Case("motor torques as joint torques", mistaken, (JOINT, "motor torques")),
     Case("joint only: A2 x 1.3", without("motor", scaled(*L, 1.3, "A2")), (JOINT, "A2")),
     Case("joint only: A5 sign", without("motor", scaled(*L, -1.0, "A5")), (JOINT, "A5")),
     Case("joint only: E1/A3 swapped", without("motor", swapped(*L, "E1", "A3")), (JOINT, "E1", "A3")),

@@ -13,6 +13,7 @@ from benchmarks.wrong_channels import (
     constant,
     frozen,
     labelled,
+    mistaken,
     paced,
     scaled,
     swapped,
@@ -116,6 +117,16 @@ def test_one_side_alone_shows_a_gain_and_a_sign(pair: list[Session]) -> None:
         assert (gain.channel, gain.joints) == (f"{side} torque", ("A2",))
         (sign,) = doubts(without(other, scaled(side, "effort", -1.0, "A3"))(pair))
         assert (sign.joints, sign.certain) == (("A3",), True)
+
+
+def test_motor_torques_that_pass_for_joint_torques_show_by_the_inertia_of_the_drives(
+    pair: list[Session],
+) -> None:
+    (doubt,) = doubts(mistaken(pair))
+    assert (doubt.channel, doubt.looks_like, doubt.certain) == ("joint torque", "motor torques", False)
+    assert "A3" in doubt.seen
+    assert "`motor_torque`" in doubt.mend
+    assert doubts(without("motor", lambda sessions: sessions)(pair)) == ()
 
 
 def test_the_sign_of_a_single_joint_shows_by_its_inertia() -> None:
