@@ -10,8 +10,8 @@ model on rows at full band, in blocks of two seconds at most: the even ones are 
   jumps of the acceleration at reversals, a higher one lets noise into it.
 * The time left out beside reversals is the one with the least held-back error far from them: a shorter one lets the
   turning of friction bend the parameters, a longer one wastes samples.
-* Slow motion is left out up to the least speed above which Coulomb friction is one constant: friction that falls with
-  the speed (Stribeck) would bend the parameters.
+* Slow motion is left out up to the least speed above which Coulomb friction rises no more towards rest: friction that
+  falls with the speed (Stribeck) would bend the parameters.
 * The friction law of the model is the one with the least held-back error over all samples, reversals and standstill
   included. The rows of the estimation have it too if it predicts the samples far from reversals better than the sign:
   a law may follow the turning of friction and still bend the friction of a moving joint.
@@ -56,7 +56,7 @@ _SPEEDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 _WIDTHS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 # Least fall of the held-back error for another law than the sign.
 _WORTH = 0.005
-# Chance below which slow motion has another friction.
+# Chance below which slow motion has more friction.
 _OTHER = 0.005
 _RIDGE = 1e-10
 # Rows of a joint for an error of its own.
@@ -382,10 +382,10 @@ def _slow_rad_s(rows: _ByClass, settings: SignalSettings, reasons: list[str]) ->
     while place > 0 and (chance := _chance(rows, faster[place - 1], faster[place])) >= _OTHER:
         place -= 1
     if not place:
-        reasons.append("slow motion: in the rows, its friction is that of a faster one")
+        reasons.append("slow motion: in the rows, its friction is no larger")
     else:
         reasons.append(
-            f"slow motion: up to {_SPEEDS[place]:g} rad/s left out, its friction is another one (p = {chance:.1g})"
+            f"slow motion: up to {_SPEEDS[place]:g} rad/s left out, its friction is larger (p = {chance:.1g})"
         )
     return _SPEEDS[place]
 
@@ -403,10 +403,11 @@ def _many(masks: _Masks, whole: _Masks) -> bool:
 
 
 def _chance(rows: _ByClass, masks: _Masks, far: _Masks) -> float:
-    """Chance, if Coulomb friction is one constant, of as much of another one in the masked rows that are not `far`.
+    """Chance, if Coulomb friction is one constant, of as much more of it in the masked rows that are not `far`.
 
     Each class has a column of the sign of its speed in those rows. The squares of the coefficients over their standard
-    deviations, of the sums in blocks, add up to a chi-square.
+    deviations, of the sums in blocks, add up to a chi-square; those of less friction, as of viscous friction that
+    saturates, count against.
     """
     values = _fit(rows, far, whole=True)
     power = {key: _power(own, values, far[key]) for key, own in rows.items()}
@@ -424,8 +425,9 @@ def _chance(rows: _ByClass, masks: _Masks, far: _Masks) -> float:
         matrix = own.matrix[used]
         free = column - matrix @ (inverse @ (matrix.T @ column)) / power[key]
         sums = np.bincount(own.block[used], free * (own.torque[used] - matrix @ values))
-        squares.append(float(np.sum(sums)) ** 2 / max(float(sums @ sums), 1e-300))
-    return float(chdtrc(len(squares), sum(squares))) if squares else 1.0
+        more = float(np.sum(sums))
+        squares.append(more * abs(more) / max(float(sums @ sums), 1e-300))
+    return float(chdtrc(len(squares), max(sum(squares), 0.0))) if squares else 1.0
 
 
 def _power(own: _Rows, values: Floats, used: NDArray[np.bool_]) -> float:

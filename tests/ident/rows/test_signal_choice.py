@@ -122,14 +122,15 @@ def test_a_drive_that_turns_slowly_has_its_reversals_left_out():
 
 
 @pytest.mark.parametrize(
-    ("speed_rad_s", "share", "low", "high"), [(0.1, 0.5, 0.1, 0.3), (0.0, 0.0, 0.0, 0.0)]
+    ("speed_rad_s", "share", "low", "high"),
+    [(0.1, 0.5, 0.1, 0.3), (0.1, -0.5, 0.0, 0.0), (0.1, 0.0, 0.0, 0.0)],
 )
-def test_slow_motion_with_another_friction_is_left_out(
+def test_slow_motion_with_more_friction_is_left_out(
     speed_rad_s: float, share: float, low: float, high: float
 ):
     session = arm.session(motor=False, sensors=sensors(), period_s=50.0, periods=2)
     speed = arm.fourier(session.joint.publish_time * 1e-9 - 3.0, 50.0, 5)[1]
-    more = share * arm.drive("Fcl") * np.sign(speed) * np.exp(-np.square(speed / max(speed_rad_s, 1e-9)))
+    more = share * arm.drive("Fcl") * np.sign(speed) * np.exp(-np.square(speed / speed_rad_s))
     stribeck = dataclasses.replace(
         session, joint=dataclasses.replace(session.joint, effort=session.joint.effort + more)
     )
