@@ -20,7 +20,7 @@ model on rows at full band, in blocks of two seconds at most: the even ones are 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -32,17 +32,29 @@ from scipy.special import chdtrc
 from ident.dynamics.parameters import Floats, split_name
 from ident.dynamics.structure import Coulomb, ModelStructure
 from ident.rows.binned import BinnedRows, observe_bins
+from ident.rows.class_rows import (
+    BIN_S,
+    LEAST,
+    ByClass,
+    ClassRows,
+    Masks,
+    Moments,
+    blocks,
+    error,
+    even,
+    fit,
+    nested,
+)
 from ident.rows.content import Kept
 from ident.rows.data_quality import passed_band
 from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass
 from ident.rows.prepare import prepare
-from ident.rows.reversals import away_from_reversals
 from ident.rows.timebase import KnownOutliers, Outliers
 from lwr_driver.session import Session
 
 logger = logging.getLogger(__name__)
 
-_BIN_S, _BLOCK_S, _LEAST_BLOCKS = 0.02, 2.0, 8
+_BLOCK_S, _LEAST_BLOCKS = 2.0, 8
 # Longest part of all sessions together used for the choice [s].
 _MOST_S = 120.0
 # Rows of a joint in a short recording, at least.
@@ -58,9 +70,6 @@ _WIDTHS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 _WORTH = 0.005
 # Chance below which slow motion has more friction.
 _OTHER = 0.005
-_RIDGE = 1e-10
-# Rows of a joint for an error of its own.
-_LEAST = 8
 # Latest choices: the same recordings are estimated several times.
 _MOST_CHOICES = 64
 
@@ -127,7 +136,7 @@ def _chosen(
     delays = [0.0 if one.delay is None else one.delay.seconds for one in rough]
     block_s = min(_BLOCK_S, min(session.duration_s for session in parts) / _LEAST_BLOCKS)
     bench = _Bench(parts, payloads, structure, columns, motor, delays, band, block_s, outliers)
-    rows: _ByClass | None = None
+    rows: ByClass | None = None
     if found.cutoff_hz is None:
         found, rows = bench.with_cutoff(found, rate, reasons)
     rows = bench.rows(found) if rows is None else rows
@@ -194,40 +203,6 @@ def _with_decimation(
 
 
 @dataclass(frozen=True)
-class _Rows:
-    """Rows of one joint and side of all sessions.
-
-    measured : (m,), neither bridged nor outliers. block : (m,), number of its block. parts, stretches : the rows of all
-    joints of each stretch, and their places here.
-    """
-
-    matrix: Floats
-    torque: Floats
-    speed: Floats
-    measured: NDArray[np.bool_]
-    block: NDArray[np.int64]
-    parts: tuple[BinnedRows, ...]
-    stretches: tuple[slice, ...]
-
-    @property
-    def even(self) -> NDArray[np.bool_]:
-        """Rows (m,) of the fitted blocks."""
-        return np.asarray(self.block % 2 == 0)
-
-    def known(self, bins: int, standstill_rad_s: float) -> NDArray[np.bool_]:
-        """Measured rows (m,) more than `bins` rows from a reversal."""
-        found = self.measured.copy()
-        for some in self.stretches:
-            speed = self.speed[some, None]
-            found[some] &= away_from_reversals(speed, _BIN_S, bins * _BIN_S, standstill_rad_s)[:, 0]
-        return found
-
-
-_ByClass = dict[tuple[str, int], _Rows]
-_Masks = Mapping[tuple[str, int], NDArray[np.bool_]]
-
-
-@dataclass(frozen=True)
 class _Bench:
     sessions: Sequence[Session]
     payloads: Sequence[str | None]
@@ -239,23 +214,23 @@ class _Bench:
     block_s: float
     outliers: Outliers
 
-    def rows(self, settings: SignalSettings) -> _ByClass:
+    def rows(self, settings: SignalSettings) -> ByClass:
         """Rows by side and joint."""
         parts: dict[str, list[BinnedRows]] = {}
         for session, payload, delay in zip(self.sessions, self.payloads, self.delays, strict=True):
             wanted = replace(settings, motor_delay_s=delay, reversal_s=0.0)
             prepared = prepare(session, wanted, motor=self.motor, log=False, outliers=self.outliers)
-            for rows in observe_bins(prepared, payload, self.structure, self.columns, _BIN_S):
+            for rows in observe_bins(prepared, payload, self.structure, self.columns, BIN_S):
                 parts.setdefault(rows.side, []).append(rows)
         found = {}
         for side, some in parts.items():
-            block = _blocks([rows.time for rows in some], self.block_s)
+            block = blocks([rows.time for rows in some], self.block_s)
             ends = np.cumsum([0, *(len(rows.time) for rows in some)]).tolist()
             stretches = tuple(slice(first, last) for first, last in pairwise(ends))
             for j in range(self.structure.chain.n):
                 measured = np.concatenate([rows.measured[:, j] for rows in some])
                 if measured.any():
-                    found[side, j] = _Rows(
+                    found[side, j] = ClassRows(
                         np.concatenate([self._smooth(rows.matrix[j], rows) for rows in some]),
                         np.concatenate(
                             [self._smooth(rows.torque[:, j : j + 1], rows)[:, 0] for rows in some]
@@ -279,16 +254,16 @@ class _Bench:
 
     def with_cutoff(
         self, settings: SignalSettings, rate: float, reasons: list[str]
-    ) -> tuple[SignalSettings, _ByClass]:
+    ) -> tuple[SignalSettings, ByClass]:
         """With the highest cut-off of a held-back error near the least, and the rows of it."""
         ladder = sorted({min(factor * settings.decimate, NYQUIST_SHARE * rate) for factor in _CUTOFFS})
         still = settings.standstill_rad_s
         errors: list[float] = []
-        kept: _ByClass = {}
+        kept: ByClass = {}
         for one in ladder:
             rows = self.rows(replace(settings, cutoff_hz=one))
             away = {key: own.known(_WINDOWS[-1] // 2, still) for key, own in rows.items()}
-            errors.append(_error(rows, _fit(rows, away), away))
+            errors.append(error(rows, fit(rows, away), away))
             # The highest so far near the least so far: no lower one can be chosen any more.
             kept = rows if errors[-1] < min(errors) + _TOLERANCE else kept
         best = int(np.argmin(errors))
@@ -301,21 +276,21 @@ class _Bench:
         reasons.append(f"positions: cut-off {chosen:g} Hz, held-back error of the base model {listed}")
         return replace(settings, cutoff_hz=chosen), kept
 
-    def laws(self, rows: _ByClass, settings: SignalSettings, reasons: list[str]) -> tuple[Coulomb, Coulomb]:
+    def laws(self, rows: ByClass, settings: SignalSettings, reasons: list[str]) -> tuple[Coulomb, Coulomb]:
         """The friction laws of the model and of the rows."""
         still = settings.standstill_rad_s
         away = _away(rows, settings)
         far = {key: own.known(_WINDOWS[-1], still) for key, own in rows.items()}
         everything = {key: own.measured for key, own in rows.items()}
-        sign = _fit(rows, away)
-        plain = _error(rows, sign, everything)
+        sign = fit(rows, away)
+        plain = error(rows, sign, everything)
         errors: dict[tuple[Coulomb, bool], float] = {}
         for width in _WIDTHS:
             law = Coulomb("tanh", width)
             smooth = self._with_law(rows, law)
-            own = _fit(smooth, away)
-            bends = _error(smooth, own, far) > _error(rows, sign, far)
-            errors[law, bends] = _error(smooth, sign if bends else own, everything)
+            own = fit(smooth, away)
+            bends = error(smooth, own, far) > error(rows, sign, far)
+            errors[law, bends] = error(smooth, sign if bends else own, everything)
         best, bends = min(errors, key=lambda key: errors[key])
         gain = plain - errors[best, bends]
         if gain < _WORTH:
@@ -328,7 +303,7 @@ class _Bench:
         )
         return best, Coulomb() if bends else best
 
-    def _with_law(self, rows: _ByClass, law: Coulomb) -> _ByClass:
+    def _with_law(self, rows: ByClass, law: Coulomb) -> ByClass:
         """The rows with their Coulomb columns anew."""
         names = [split_name(self.structure.names[c]) for c in self.columns]
         parts = {id(part): part for own in rows.values() for part in own.parts}
@@ -346,27 +321,19 @@ class _Bench:
         return found
 
 
-def _blocks(times: Sequence[Floats], block_s: float) -> NDArray[np.int64]:
-    """Number of each row's block, of rows at the times [s] of several stretches; even blocks are even in all."""
-    first, found = 0, []
-    for time in times:
-        found.append(np.floor(time / block_s).astype(np.int64) + first)
-        first = (int(found[-1].max(initial=first)) // 2 + 1) * 2
-    return np.concatenate(found)
-
-
-def _reversal_s(rows: _ByClass, band: float | None, standstill_rad_s: float, reasons: list[str]) -> float:
+def _reversal_s(rows: ByClass, band: float | None, standstill_rad_s: float, reasons: list[str]) -> float:
     """Time left out beside reversals [s]."""
-    if band is not None and band * _WINDOWS[-1] * _BIN_S < 2.0:
+    if band is not None and band * _WINDOWS[-1] * BIN_S < 2.0:
         reasons.append(
             f"reversals: nothing left out, an earlier low-pass at {band:.2g} Hz spread them; the same low-pass on "
             "torque and friction columns allows for it"
         )
         return 0.0
     masks = [{key: own.known(window, standstill_rad_s) for key, own in rows.items()} for window in _WINDOWS]
-    errors = [_error(rows, _fit(rows, mask), masks[-1]) for mask in masks]
+    fitted = nested(rows, [even(rows, mask) for mask in masks])
+    errors = [error(rows, one.solved()[0], masks[-1]) for one in fitted]
     best = int(np.argmin(errors))
-    chosen = _WINDOWS[best] * _BIN_S
+    chosen = _WINDOWS[best] * BIN_S
     reasons.append(
         f"reversals: {1e3 * chosen:.0f} ms left out on either side, held-back error far from reversals "
         f"{100.0 * np.expm1(errors[0] - errors[best]):.2f} % less than with all samples"
@@ -374,102 +341,59 @@ def _reversal_s(rows: _ByClass, band: float | None, standstill_rad_s: float, rea
     return chosen
 
 
-def _slow_rad_s(rows: _ByClass, settings: SignalSettings, reasons: list[str]) -> float:
+def _slow_rad_s(rows: ByClass, settings: SignalSettings, reasons: list[str]) -> float:
     """Speed up to which slow motion is left out [rad/s]."""
-    faster = [_away(rows, replace(settings, slow_rad_s=speed)) for speed in _SPEEDS]
-    place = max(k for k, masks in enumerate(faster) if k == 0 or _many(masks, faster[0]))
-    chance = 1.0
-    while place > 0 and (chance := _chance(rows, faster[place - 1], faster[place])) >= _OTHER:
+    away = _away(rows, settings)
+    faster = [
+        {key: mask & (np.abs(rows[key].speed) > speed) for key, mask in away.items()} for speed in _SPEEDS
+    ]
+    place = max(k for k, masks in enumerate(faster) if k == 0 or _many(masks, away))
+    fitted, chance = nested(rows, faster[: place + 1]), 1.0
+    while place > 0:
+        chance = _chance(rows, fitted[place - 1], faster[place - 1], faster[place])
+        if chance < _OTHER:
+            reasons.append(
+                f"slow motion: up to {_SPEEDS[place]:g} rad/s left out, its friction is larger (p = {chance:.1g})"
+            )
+            return _SPEEDS[place]
         place -= 1
-    if not place:
-        reasons.append("slow motion: in the rows, its friction is no larger")
-    else:
-        reasons.append(
-            f"slow motion: up to {_SPEEDS[place]:g} rad/s left out, its friction is larger (p = {chance:.1g})"
-        )
-    return _SPEEDS[place]
+    reasons.append("slow motion: in the rows, its friction is no larger")
+    return 0.0
 
 
-def _away(rows: _ByClass, settings: SignalSettings) -> _Masks:
+def _away(rows: ByClass, settings: SignalSettings) -> Masks:
     """The rows away from reversals and slow motion."""
-    bins = round(settings.reversal / _BIN_S)
+    bins = round(settings.reversal / BIN_S)
     away = {key: own.known(bins, settings.standstill_rad_s) for key, own in rows.items()}
     return {key: mask & (np.abs(rows[key].speed) > settings.slow) for key, mask in away.items()}
 
 
-def _many(masks: _Masks, whole: _Masks) -> bool:
+def _many(masks: Masks, whole: Masks) -> bool:
     """Whether the masks have a third of the rows of every joint and side."""
     return all(3 * masks[key].sum() >= some.sum() for key, some in whole.items())
 
 
-def _chance(rows: _ByClass, masks: _Masks, far: _Masks) -> float:
+def _chance(rows: ByClass, fitted: Moments, masks: Masks, far: Masks) -> float:
     """Chance, if Coulomb friction is one constant, of as much more of it in the masked rows that are not `far`.
 
     Each class has a column of the sign of its speed in those rows. The squares of the coefficients over their standard
     deviations, of the sums in blocks, add up to a chi-square; those of less friction, as of viscous friction that
     saturates, count against.
+
+    fitted : moments of the masked rows.
     """
-    values = _fit(rows, far, whole=True)
-    power = {key: _power(own, values, far[key]) for key, own in rows.items()}
-    grams = [own.matrix[masks[key]].T @ own.matrix[masks[key]] / power[key] for key, own in rows.items()]
-    inverse = np.linalg.pinv(np.sum(grams, axis=0), hermitian=True)
-    right = [own.matrix[masks[key]].T @ own.torque[masks[key]] / power[key] for key, own in rows.items()]
-    values = inverse @ np.sum(right, axis=0)
+    values, weights = fitted.solved()
+    columns = {key: np.sign(own.speed) * (masks[key] & ~far[key]) for key, own in rows.items()}
+    products = np.array([own.matrix.T @ columns[key] for key, own in rows.items()])
+    shared = fitted.divided(weights, (weights[:, None] * products).T)
     squares = []
-    for key, own in rows.items():
-        used = masks[key]
-        near = (used & ~far[key])[used]
-        if near.sum() < _LEAST:
+    for (key, own), others in zip(rows.items(), shared.T, strict=True):
+        if np.count_nonzero(columns[key]) < LEAST:
             continue
-        column = np.sign(own.speed[used]) * near
+        used = masks[key]
         matrix = own.matrix[used]
-        free = column - matrix @ (inverse @ (matrix.T @ column)) / power[key]
+        free = columns[key][used] - matrix @ others
         sums = np.bincount(own.block[used], free * (own.torque[used] - matrix @ values))
         more = float(np.sum(sums))
         squares.append(more * abs(more) / max(float(sums @ sums), 1e-300))
     return float(chdtrc(len(squares), max(sum(squares), 0.0))) if squares else 1.0
-
-
-def _power(own: _Rows, values: Floats, used: NDArray[np.bool_]) -> float:
-    """Mean square of the residual in the used rows [Nm^2], of exact rows a share of the torque's."""
-    torque = own.torque[used]
-    residual = torque - own.matrix[used] @ values
-    return (float(residual @ residual) + 1e-12 * float(torque @ torque) + 1e-300) / max(len(torque), 1)
-
-
-def _fit(rows: _ByClass, masks: _Masks, *, whole: bool = False) -> Floats:
-    """Weighted least squares of the masked rows in the even blocks, or in all."""
-    grams, targets, squares, counts = [], [], [], []
-    for key, own in rows.items():
-        used = masks[key] & (own.even | whole)
-        matrix, torque = own.matrix[used], own.torque[used]
-        grams.append(matrix.T @ matrix)
-        targets.append(matrix.T @ torque)
-        squares.append(float(torque @ torque))
-        counts.append(max(int(used.sum()), 1))
-    weights = np.ones(len(grams))
-    values = np.zeros(grams[0].shape[0])
-    for _ in range(3):
-        normal = np.tensordot(weights, np.array(grams), axes=1)
-        right = weights @ np.array(targets)
-        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        scaled = normal / np.outer(scale, scale) + _RIDGE * np.eye(len(scale))
-        values = np.linalg.solve(scaled, right / scale) / scale
-        powers = [
-            max(float(square - 2.0 * values @ target + values @ gram @ values), 1e-12 * square + 1e-300)
-            / count
-            for gram, target, square, count in zip(grams, targets, squares, counts, strict=True)
-        ]
-        weights = 1.0 / np.array(powers)
-    return values
-
-
-def _error(rows: _ByClass, values: Floats, masks: _Masks) -> float:
-    """Mean over joints and sides of the log residual [log Nm] of the masked rows in the odd blocks."""
-    logs = []
-    for key, own in rows.items():
-        used = masks[key] & ~own.even
-        if used.sum() >= _LEAST:
-            residual = own.torque[used] - own.matrix[used] @ values
-            logs.append(0.5 * float(np.log(np.mean(residual**2) + 1e-300)))
-    return float(np.mean(logs)) if logs else 0.0

@@ -11,6 +11,7 @@ from fri.errors import DataError
 from ident.dynamics.structure import DriveMotion, ModelStructure
 from ident.rows import observation
 from ident.rows.binned import _add_means, bins
+from ident.rows.class_rows import ClassRows
 from ident.rows.delay import Delay, DelayData, estimate_delay
 from ident.rows.filters import SignalSettings, half_width, low_pass, settling
 from ident.rows.prepare import (
@@ -24,7 +25,7 @@ from ident.rows.prepare import (
     clock_ns,
     prepare,
 )
-from ident.rows.signal_choice import _Bench, _excerpt, _reversal_s, _Rows, _with_decimation
+from ident.rows.signal_choice import _Bench, _excerpt, _reversal_s, _with_decimation
 from ident.rows.timebase import flag_outliers, stretches
 from lwr_driver.session import Phase
 from tests.ident import estimation_arm as arm
@@ -306,7 +307,7 @@ def test_an_earlier_filter_over_the_widest_window_leaves_the_reversals_in() -> N
     count = 400
     speed = np.sin(0.2 * np.arange(count))
     rows = {
-        ("joint", 0): _Rows(
+        ("joint", 0): ClassRows(
             speed[:, None], 2.0 * speed, speed, np.ones(count, dtype=bool), np.arange(count) // 50, (),
             (slice(0, count),),
         )
@@ -413,7 +414,7 @@ def test_a_commanded_motion_without_error_is_the_measured_one() -> None:
 
 
 @pytest.mark.parametrize("extra", range(9))
-def test_a_stretch_of_a_few_samples_between_gaps_gives_no_row_and_no_error(extra: int) -> None:
+def test_a_stretch_of_a_few_samples_between_gaps_gives_no_row_and_noerror(extra: int) -> None:
     session = arm.session(period_s=4.0, sensors=arm.Sensors(joint=0.1, motor=0.1))
     cut = round(SignalSettings().settled(1.0 / session.joint.period_s).edge / session.joint.period_s)
     # Around t = 8.2 s, a time of a row; the gaps are longer than any bridge.

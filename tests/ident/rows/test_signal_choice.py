@@ -9,8 +9,9 @@ import pytest
 
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.structure import Coulomb, ModelStructure
+from ident.rows.class_rows import ClassRows, blocks, error, fit
 from ident.rows.filters import SignalSettings
-from ident.rows.signal_choice import SignalChoice, _blocks, _error, _fit, _Rows, choose_signals
+from ident.rows.signal_choice import SignalChoice, choose_signals
 from tests.ident import estimation_arm as arm
 
 
@@ -141,7 +142,7 @@ def test_slow_motion_with_more_friction_is_left_out(
 
 def test_blocks_are_even_in_every_stretch():
     times = [np.array([0.0, 1.9, 2.0, 6.5]), np.array([5.0, 6.0]), np.array([0.5])]
-    np.testing.assert_array_equal(_blocks(times, 2.0), [0, 0, 1, 3, 6, 7, 8])
+    np.testing.assert_array_equal(blocks(times, 2.0), [0, 0, 1, 3, 6, 7, 8])
 
 
 def test_samples_beside_the_reversals_of_an_ideal_drive_without_noise_stay():
@@ -155,21 +156,21 @@ def test_a_long_recording_is_judged_by_a_part_of_it():
     assert chosen(session).settings.decimate_hz == 2.0
 
 
-def made(torque, matrix, even) -> _Rows:
+def made(torque, matrix, even) -> ClassRows:
     count = len(torque)
     whole = np.ones(count, dtype=bool)
     block = np.where(even, 0, 1)
-    return _Rows(matrix, torque, np.ones(count), whole, block, (), (slice(0, count),))
+    return ClassRows(matrix, torque, np.ones(count), whole, block, (), (slice(0, count),))
 
 
-def test_a_loud_class_has_little_weight_in_the_fit():
+def test_a_loud_class_has_little_weight_in_thefit():
     random = np.random.default_rng(0)
     matrix = random.normal(size=(400, 1))
     even = np.arange(400) % 2 == 0
     clean = made(2.0 * matrix[:, 0] + 0.01 * random.normal(size=400), matrix, even)
     loud = made(3.0 * matrix[:, 0] + 5.0 * random.normal(size=400), matrix, even)
     masks = {key: np.ones(400, dtype=bool) for key in (("joint", 0), ("joint", 1))}
-    values = _fit({("joint", 0): clean, ("joint", 1): loud}, masks)
+    values = fit({("joint", 0): clean, ("joint", 1): loud}, masks)
     assert values[0] == pytest.approx(2.0, abs=3e-3)
 
 
@@ -178,16 +179,16 @@ def test_even_blocks_are_fitted_and_odd_ones_predicted():
     torque = np.where(even, 1.0, 4.0)
     rows = {("joint", 0): made(torque, matrix, even), ("motor", 0): made(2.0 * torque, 2.0 * matrix, even)}
     masks = {key: np.ones(40, dtype=bool) for key in rows}
-    values = _fit(rows, masks)
+    values = fit(rows, masks)
     assert values == pytest.approx([1.0])
-    assert _error(rows, values, masks) == pytest.approx(np.mean(np.log([3.0, 6.0])))
+    assert error(rows, values, masks) == pytest.approx(np.mean(np.log([3.0, 6.0])))
 
 
-@pytest.mark.parametrize(("count", "error"), [(7, 0.0), (8, np.log(3.0))])
-def test_a_class_with_fewer_than_eight_rows_has_no_error(count: int, error: float):
+@pytest.mark.parametrize(("count", "expected"), [(7, 0.0), (8, np.log(3.0))])
+def test_a_class_with_fewer_than_eight_rows_has_no_error(count: int, expected: float):
     even = np.zeros(40, dtype=bool)
     rows = {("joint", 0): made(np.full(40, 3.0), np.ones((40, 1)), even)}
-    assert _error(rows, np.zeros(1), {("joint", 0): np.arange(40) < count}) == pytest.approx(error)
+    assert error(rows, np.zeros(1), {("joint", 0): np.arange(40) < count}) == pytest.approx(expected)
 
 
 def test_rows_beside_a_reversal_are_unknown_in_their_stretch_alone():
