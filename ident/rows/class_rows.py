@@ -42,12 +42,14 @@ class ClassRows:
         """Rows (m,) of the fitted blocks."""
         return np.asarray(self.block % 2 == 0)
 
-    def known(self, bins: int, standstill_rad_s: float) -> NDArray[np.bool_]:
-        """Measured rows (m,) more than `bins` rows from a reversal."""
+    def known(self, bins: int, standstill_rad_s: float, turning_rad: float) -> NDArray[np.bool_]:
+        """Measured rows (m,) more than `bins` rows and the path `turning_rad` from a reversal."""
         found = self.measured.copy()
         for some in self.stretches:
             speed = self.speed[some, None]
-            found[some] &= away_from_reversals(speed, BIN_S, bins * BIN_S, standstill_rad_s)[:, 0]
+            found[some] &= away_from_reversals(speed, BIN_S, bins * BIN_S, standstill_rad_s, turning_rad)[
+                :, 0
+            ]
         return found
 
 

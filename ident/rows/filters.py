@@ -20,6 +20,7 @@ from fri.errors import ConfigurationError
 from fri.quantities import within
 from ident.dynamics.parameters import Floats
 from ident.rows.butterworth import forward_and_back, sections, spectrum
+from ident.rows.reversals import TURNING_RAD
 
 # The paper's filters, section 5, and a time beside reversals that covers the turning of a strain-wave drive.
 CUTOFF_HZ, DECIMATE_HZ, REVERSAL_S = 10.0, 2.0, 0.05
@@ -47,6 +48,8 @@ class SignalSettings:
     longest_bridge_s : longest gap bridged by interpolation; a longer one splits the record.
     reversal_s : samples of a joint this close to its reversal have no part in its rows, because friction turns
         there in a way that no sign function follows (presliding, stiction, a motor that reverses later).
+    turning_rad : nor have samples of a joint that has not gone this far since its reversal or rest: presliding turns
+        over a path.
     slow_rad_s : samples of a joint not faster than this have no part in its rows, because friction of many drives
         falls with the speed (Stribeck).
     standstill_rad_s : a joint below this speed rests, and its Coulomb torque is unknown.
@@ -68,6 +71,7 @@ class SignalSettings:
     edge_s: _Span | None = None
     longest_bridge_s: _Span = 0.02
     reversal_s: _Span | None = None
+    turning_rad: Annotated[float, within(0.0, 1.0, "rad")] | None = None
     slow_rad_s: Annotated[float, within(0.0, 100.0, "rad/s")] | None = None
     standstill_rad_s: Annotated[float, within(0.0, 100.0, "rad/s")] = 2e-3
     known_share: Annotated[float, within(0.0, 1.0, "share")] = 0.4
@@ -108,7 +112,12 @@ class SignalSettings:
         decimate = min(DECIMATE_HZ, cutoff / 1.5) if self.decimate_hz is None else self.decimate_hz
         cutoff = max(cutoff, decimate)
         return replace(
-            self, cutoff_hz=cutoff, decimate_hz=decimate, reversal_s=self.reversal, slow_rad_s=self.slow
+            self,
+            cutoff_hz=cutoff,
+            decimate_hz=decimate,
+            reversal_s=self.reversal,
+            turning_rad=self.turning,
+            slow_rad_s=self.slow,
         )
 
     @property
@@ -125,6 +134,13 @@ class SignalSettings:
     def reversal(self) -> float:
         """Time left out on either side of a reversal [s]."""
         return REVERSAL_S if self.reversal_s is None else self.reversal_s
+
+    @property
+    def turning(self) -> float:
+        """Path left out after a reversal [rad]; none beside a reversal that stays."""
+        if self.turning_rad is None:
+            return TURNING_RAD if self.reversal > 0.0 else 0.0
+        return self.turning_rad
 
     @property
     def slow(self) -> float:

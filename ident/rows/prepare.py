@@ -371,7 +371,8 @@ class _Motion:
     ) -> _Motion:
         """The samples from span[0] to before span[1], filtered with those around."""
         joints = effort_flags.shape[1]
-        seen = turning_reach(settings.reversal, settings.standstill_rad_s)
+        beside = settings.reversal, settings.standstill_rad_s, settings.turning
+        seen = turning_reach(*beside)
         around = int(np.ceil((settling(settings.cutoff, settings.order) + seen) / part.dt)) + 16
         low, high = max(span[0] - around, 0), min(span[1] + around, part.count)
         values = part.part(low, high)
@@ -387,7 +388,7 @@ class _Motion:
             flagged[spread[(spread >= 0) & (spread < len(grid))], joint] = True
             good = ~flagged[:, joint]
             torque[~good, joint] = np.interp(grid[~good], grid[good], torque[good, joint])
-        away = away_from_reversals(qd, part.dt, settings.reversal, settings.standstill_rad_s)
+        away = away_from_reversals(qd, part.dt, *beside)
         away &= np.abs(qd) > settings.slow
         drive = None
         kept = slice(span[0] - low, span[1] - low)

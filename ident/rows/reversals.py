@@ -8,30 +8,30 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from ident.dynamics.parameters import Floats
 
-# Friction of a drive turns over a path: tenths of a milliradian in strain-wave gears, whatever the time it takes.
 TURNING_RAD = 1e-3
+"""Friction of a drive turns over a path: tenths of a milliradian in strain-wave gears, whatever the time it takes."""
+_LONGEST_S = 10.0
 
 
 def away_from_reversals(
-    speed: Floats, dt: float, window_s: float, standstill_rad_s: float
+    speed: Floats, dt: float, window_s: float, standstill_rad_s: float, turning_rad: float
 ) -> NDArray[np.bool_]:
-    """Samples (n, J) whose joint keeps its direction, faster than standstill, for `window_s` before and after.
-
-    Since its reversal or rest the joint has also gone `TURNING_RAD`; a window of zero leaves out the standstill alone.
+    """Samples (n, J) whose joint keeps its direction, faster than standstill, for `window_s` before and after, and has
+    gone `turning_rad` since its reversal or rest.
 
     speed : (n, J) every `dt` seconds [rad/s].
     """
     size = 2 * round(window_s / dt) + 1
     lowest, highest = minimum_filter1d(speed, size, axis=0), maximum_filter1d(speed, size, axis=0)
     away = np.asarray((lowest > standstill_rad_s) | (highest < -standstill_rad_s))
-    if size > 1:
-        away &= _path(speed, dt, standstill_rad_s) >= TURNING_RAD
+    if turning_rad > 0.0:
+        away &= _path(speed, dt, standstill_rad_s) >= turning_rad
     return away
 
 
-def turning_reach(window_s: float, standstill_rad_s: float) -> float:
+def turning_reach(window_s: float, standstill_rad_s: float, turning_rad: float) -> float:
     """Time [s] that `away_from_reversals` looks back and ahead: that of the path at the slowest speed, 10 s at most."""
-    return window_s + (TURNING_RAD / max(standstill_rad_s, 1e-4) if window_s > 0.0 else 0.0)
+    return window_s + min(turning_rad / max(standstill_rad_s, 1e-4), _LONGEST_S)
 
 
 def _path(speed: Floats, dt: float, standstill_rad_s: float) -> Floats:

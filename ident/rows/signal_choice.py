@@ -10,6 +10,8 @@ model on rows at full band, in blocks of two seconds at most: the even ones are 
   jumps of the acceleration at reversals, a higher one lets noise into it.
 * The time left out beside reversals is the one with the least held-back error far from them: a shorter one lets the
   turning of friction bend the parameters, a longer one wastes samples.
+* The path left out after a reversal is the shortest after which Coulomb friction is one constant: presliding turns over
+  a path.
 * Slow motion is left out up to the least speed above which Coulomb friction rises no more towards rest: friction that
   falls with the speed (Stribeck) would bend the parameters.
 * The friction law of the model is the one with the least held-back error over all samples, reversals and standstill
@@ -49,6 +51,7 @@ from ident.rows.content import Kept
 from ident.rows.data_quality import passed_band
 from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass
 from ident.rows.prepare import prepare
+from ident.rows.reversals import TURNING_RAD
 from ident.rows.timebase import KnownOutliers, Outliers
 from lwr_driver.session import Session
 
@@ -63,12 +66,14 @@ _CUTOFFS = (2.5, 5.0, 12.5)
 _TOLERANCE = 0.005
 # Bins left out beside a reversal; the last ones are far from it.
 _WINDOWS = (0, 1, 2, 3, 4, 5, 7, 10)
+# Paths left out after a reversal [rad].
+_PATHS = (2e-3, 5e-3, 1e-2)
 # Speeds up to which slow motion is left out [rad/s].
 _SPEEDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 _WIDTHS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 # Least fall of the held-back error for another law than the sign.
 _WORTH = 0.005
-# Chance below which slow motion has more friction.
+# Chance below which friction beside reversals or in slow motion is another one.
 _OTHER = 0.005
 # Latest choices: the same recordings are estimated several times.
 _MOST_CHOICES = 64
@@ -100,7 +105,13 @@ def choose_signals(
     payloads : mounted in each session. columns : base columns of the structure. outliers : as for `prepare`.
     """
     coulomb, row_coulomb = laws
-    given = None not in (settings.cutoff_hz, settings.decimate_hz, settings.reversal_s, settings.slow_rad_s)
+    given = None not in (
+        settings.cutoff_hz,
+        settings.decimate_hz,
+        settings.reversal_s,
+        settings.turning_rad,
+        settings.slow_rad_s,
+    )
     if given and coulomb is not None:
         return SignalChoice(settings, coulomb, row_coulomb or coulomb)
     parts = [_excerpt(session, _MOST_S / len(sessions)) for session in sessions]
@@ -142,8 +153,13 @@ def _chosen(
     rows = bench.rows(found) if rows is None else rows
     if found.reversal_s is None:
         found = replace(found, reversal_s=_reversal_s(rows, band, found.standstill_rad_s, reasons))
+    if band is not None:
+        # Friction is spread over the rows around; nothing is told from them.
+        found = replace(found, turning_rad=found.turning, slow_rad_s=found.slow)
+    if found.turning_rad is None:
+        found = replace(found, turning_rad=_turning_rad(rows, found, reasons))
     if found.slow_rad_s is None:
-        found = replace(found, slow_rad_s=0.0 if band is not None else _slow_rad_s(rows, found, reasons))
+        found = replace(found, slow_rad_s=_slow_rad_s(rows, found, reasons))
     law, row_law = (coulomb, row_coulomb or coulomb) if coulomb else bench.laws(rows, found, reasons)
     return SignalChoice(found, law, row_law, tuple(reasons))
 
@@ -262,7 +278,7 @@ class _Bench:
         kept: ByClass = {}
         for one in ladder:
             rows = self.rows(replace(settings, cutoff_hz=one))
-            away = {key: own.known(_WINDOWS[-1] // 2, still) for key, own in rows.items()}
+            away = {key: own.known(_WINDOWS[-1] // 2, still, TURNING_RAD) for key, own in rows.items()}
             errors.append(error(rows, fit(rows, away), away))
             # The highest so far near the least so far: no lower one can be chosen any more.
             kept = rows if errors[-1] < min(errors) + _TOLERANCE else kept
@@ -280,7 +296,7 @@ class _Bench:
         """The friction laws of the model and of the rows."""
         still = settings.standstill_rad_s
         away = _away(rows, settings)
-        far = {key: own.known(_WINDOWS[-1], still) for key, own in rows.items()}
+        far = {key: own.known(_WINDOWS[-1], still, TURNING_RAD) for key, own in rows.items()}
         everything = {key: own.measured for key, own in rows.items()}
         sign = fit(rows, away)
         plain = error(rows, sign, everything)
@@ -329,7 +345,10 @@ def _reversal_s(rows: ByClass, band: float | None, standstill_rad_s: float, reas
             "torque and friction columns allows for it"
         )
         return 0.0
-    masks = [{key: own.known(window, standstill_rad_s) for key, own in rows.items()} for window in _WINDOWS]
+    masks = [
+        {key: own.known(window, standstill_rad_s, TURNING_RAD * bool(window)) for key, own in rows.items()}
+        for window in _WINDOWS
+    ]
     fitted = nested(rows, [even(rows, mask) for mask in masks])
     errors = [error(rows, one.solved()[0], masks[-1]) for one in fitted]
     best = int(np.argmin(errors))
@@ -341,30 +360,53 @@ def _reversal_s(rows: ByClass, band: float | None, standstill_rad_s: float, reas
     return chosen
 
 
+def _turning_rad(rows: ByClass, settings: SignalSettings, reasons: list[str]) -> float:
+    """Path left out after a reversal [rad]."""
+    paths = [settings.turning, *(path for path in _PATHS if path > settings.turning)]
+    farther = [_away(rows, replace(settings, turning_rad=path)) for path in paths]
+    place, chance = _first_alike(rows, farther, both=True)
+    if place:
+        reasons.append(
+            f"turning: the first {1e3 * paths[place]:g} mrad after a reversal left out, where friction still turns "
+            f"(p = {chance:.1g})"
+        )
+    return paths[place]
+
+
 def _slow_rad_s(rows: ByClass, settings: SignalSettings, reasons: list[str]) -> float:
     """Speed up to which slow motion is left out [rad/s]."""
     away = _away(rows, settings)
     faster = [
         {key: mask & (np.abs(rows[key].speed) > speed) for key, mask in away.items()} for speed in _SPEEDS
     ]
-    place = max(k for k, masks in enumerate(faster) if k == 0 or _many(masks, away))
-    fitted, chance = nested(rows, faster[: place + 1]), 1.0
+    place, chance = _first_alike(rows, faster, both=False)
+    slow = _SPEEDS[place]
+    reasons.append(
+        f"slow motion: up to {slow:g} rad/s left out, its friction is larger (p = {chance:.1g})"
+        if place
+        else "slow motion: in the rows, its friction is no larger"
+    )
+    return slow
+
+
+def _first_alike(rows: ByClass, masks: Sequence[Masks], *, both: bool) -> tuple[int, float]:
+    """Number of the first of ever smaller masks whose Coulomb friction is one constant, and the chance of that in the
+    mask before. A third of the rows of every joint and side stay. both : see `_chance`."""
+    place = max(k for k, mask in enumerate(masks) if k == 0 or _many(mask, masks[0]))
+    fitted = nested(rows, masks[: place + 1])
     while place > 0:
-        chance = _chance(rows, fitted[place - 1], faster[place - 1], faster[place])
+        chance = _chance(rows, fitted[place - 1], masks[place - 1], masks[place], both)
         if chance < _OTHER:
-            reasons.append(
-                f"slow motion: up to {_SPEEDS[place]:g} rad/s left out, its friction is larger (p = {chance:.1g})"
-            )
-            return _SPEEDS[place]
+            return place, chance
         place -= 1
-    reasons.append("slow motion: in the rows, its friction is no larger")
-    return 0.0
+    return 0, 1.0
 
 
 def _away(rows: ByClass, settings: SignalSettings) -> Masks:
     """The rows away from reversals and slow motion."""
     bins = round(settings.reversal / BIN_S)
-    away = {key: own.known(bins, settings.standstill_rad_s) for key, own in rows.items()}
+    beside = settings.standstill_rad_s, settings.turning
+    away = {key: own.known(bins, *beside) for key, own in rows.items()}
     return {key: mask & (np.abs(rows[key].speed) > settings.slow) for key, mask in away.items()}
 
 
@@ -373,14 +415,14 @@ def _many(masks: Masks, whole: Masks) -> bool:
     return all(3 * masks[key].sum() >= some.sum() for key, some in whole.items())
 
 
-def _chance(rows: ByClass, fitted: Moments, masks: Masks, far: Masks) -> float:
-    """Chance, if Coulomb friction is one constant, of as much more of it in the masked rows that are not `far`.
+def _chance(rows: ByClass, fitted: Moments, masks: Masks, far: Masks, both: bool) -> float:
+    """Chance, if Coulomb friction is one constant, of as much another one in the masked rows that are not `far`.
 
     Each class has a column of the sign of its speed in those rows. The squares of the coefficients over their standard
-    deviations, of the sums in blocks, add up to a chi-square; those of less friction, as of viscous friction that
-    saturates, count against.
+    deviations, of the sums in blocks, add up to a chi-square.
 
-    fitted : moments of the masked rows.
+    fitted : moments of the masked rows. both : False for more friction alone; less, as of viscous friction that
+        saturates, counts against.
     """
     values, weights = fitted.solved()
     columns = {key: np.sign(own.speed) * (masks[key] & ~far[key]) for key, own in rows.items()}
@@ -395,5 +437,6 @@ def _chance(rows: ByClass, fitted: Moments, masks: Masks, far: Masks) -> float:
         free = columns[key][used] - matrix @ others
         sums = np.bincount(own.block[used], free * (own.torque[used] - matrix @ values))
         more = float(np.sum(sums))
-        squares.append(more * abs(more) / max(float(sums @ sums), 1e-300))
+        square = more * more if both else more * abs(more)
+        squares.append(square / max(float(sums @ sums), 1e-300))
     return float(chdtrc(len(squares), max(sum(squares), 0.0))) if squares else 1.0

@@ -380,7 +380,7 @@ def test_every_key_of_the_settings_reaches_the_identification(tmp_path: Path) ->
         "signals": {
             "cutoff_hz": 9.0, "order": 3, "decimate_hz": 3.0, "rate_hz": 6.0, "attenuation_db": 50.0,
             "average_periods": True, "edge_s": 0.4, "longest_bridge_s": 0.03,
-            "reversal_s": 0.03, "slow_rad_s": 0.02, "standstill_rad_s": 0.003, "known_share": 0.5,
+            "reversal_s": 0.03, "turning_rad": 0.002, "slow_rad_s": 0.02, "standstill_rad_s": 0.003, "known_share": 0.5,
             "stiffness_nm_rad": [10000, 9000, 8000, 8000, 7000, 6000, 5000], "outlier_scale": 6.0,
             "motor_delay_s": 0.004, "delay_search_s": 0.05,
         },

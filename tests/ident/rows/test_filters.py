@@ -28,7 +28,8 @@ def test_the_settings_begin_as_documented() -> None:
     found = {field.name: getattr(SignalSettings(), field.name) for field in fields(SignalSettings)}
     assert found == {
         "cutoff_hz": None, "order": 4, "decimate_hz": None, "rate_hz": None, "attenuation_db": 40.0,
-        "average_periods": False, "edge_s": None, "longest_bridge_s": 0.02, "reversal_s": None, "slow_rad_s": None,
+        "average_periods": False, "edge_s": None, "longest_bridge_s": 0.02, "reversal_s": None, "turning_rad": None,
+        "slow_rad_s": None,
         "standstill_rad_s": 2e-3, "known_share": 0.4, "outlier_scale": 8.0, "motor_delay_s": "estimate",
         "delay_search_s": 0.1, "stiffness_nm_rad": None,
     }  # fmt: skip

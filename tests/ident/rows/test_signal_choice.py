@@ -36,7 +36,9 @@ def test_every_open_figure_is_set_and_explained():
 
 
 def test_stated_figures_stay():
-    settings = SignalSettings(cutoff_hz=7.0, decimate_hz=3.0, reversal_s=0.04, slow_rad_s=0.03)
+    settings = SignalSettings(
+        cutoff_hz=7.0, decimate_hz=3.0, reversal_s=0.04, turning_rad=0.0, slow_rad_s=0.03
+    )
     law = Coulomb("tanh", 0.01)
     found = chosen(arm.session(motor=False), settings, law)
     assert (found.settings, found.coulomb, found.row_coulomb, found.reasons) == (settings, law, law, ())
@@ -140,6 +142,22 @@ def test_slow_motion_with_more_friction_is_left_out(
     assert any(reason.startswith("slow motion: ") for reason in found.reasons)
 
 
+def test_a_path_of_presliding_is_left_out():
+    session = arm.session(motor=False, sensors=sensors(), period_s=20.0, periods=4)
+    time = session.joint.publish_time * 1e-9 - 3.0
+    q, speed = arm.fourier(time, 20.0, 5)[:2]
+    turned = np.vstack([np.ones((1, q.shape[1]), dtype=bool), np.diff(np.sign(speed), axis=0) != 0.0])
+    gone = np.cumsum(np.abs(np.diff(q, axis=0, prepend=q[:1])), axis=0)
+    since = gone - np.maximum.accumulate(np.where(turned, gone, 0.0), axis=0)
+    less = -2.0 * arm.drive("Fcl") * np.sign(speed) * np.exp(-since / 2e-3)
+    presliding = dataclasses.replace(
+        session, joint=dataclasses.replace(session.joint, effort=session.joint.effort + less)
+    )
+    beside = SignalSettings(reversal_s=0.02)
+    assert 5e-3 <= chosen(presliding, beside, Coulomb()).settings.turning_rad <= 1e-2
+    assert chosen(session, beside, Coulomb()).settings.turning_rad == 1e-3
+
+
 def test_blocks_are_even_in_every_stretch():
     times = [np.array([0.0, 1.9, 2.0, 6.5]), np.array([5.0, 6.0]), np.array([0.5])]
     np.testing.assert_array_equal(blocks(times, 2.0), [0, 0, 1, 3, 6, 7, 8])
@@ -195,8 +213,8 @@ def test_rows_beside_a_reversal_are_unknown_in_their_stretch_alone():
     rows = made(np.ones(12), np.ones((12, 1)), np.ones(12, dtype=bool))
     speed = np.array([1, 1, 1, -1, -1, -1, 1, 1, 1, 1, 1, 1.0])
     turning = dataclasses.replace(rows, speed=speed, stretches=(slice(0, 6), slice(6, 12)))
-    assert np.flatnonzero(~turning.known(1, 0.1)).tolist() == [2, 3]
-    assert np.flatnonzero(~turning.known(0, 0.1)).tolist() == []
+    assert np.flatnonzero(~turning.known(1, 0.1, 1e-3)).tolist() == [2, 3]
+    assert np.flatnonzero(~turning.known(0, 0.1, 0.0)).tolist() == []
 
 
 def test_noisy_positions_have_a_lower_cut_off_than_clean_ones():

@@ -41,23 +41,23 @@ from tests.ident import estimation_arm as arm
 
 def test_samples_within_the_window_of_a_reversal_and_at_standstill_are_left_out():
     speed = np.where(np.arange(40) < 20, -1.0, 1.0)[:, None]
-    away = away_from_reversals(speed, 0.01, 0.03, 0.002)[:, 0]
+    away = away_from_reversals(speed, 0.01, 0.03, 0.002, 1e-3)[:, 0]
     assert np.flatnonzero(~away).tolist() == [17, 18, 19, 20, 21, 22]
-    assert away_from_reversals(speed, 0.01, 0.0, 0.002).all()
+    assert away_from_reversals(speed, 0.01, 0.0, 0.002, 0.0).all()
     for rate, rests in ((0.002, True), (0.0021, False)):
         for sign in (1.0, -1.0):
             slow = np.full((5, 1), sign * rate)
-            assert away_from_reversals(slow, 0.01, 0.0, 0.002).any() != rests
+            assert away_from_reversals(slow, 0.01, 0.0, 0.002, 0.0).any() != rests
 
 
 def test_a_slow_joint_has_to_go_on_for_the_path_on_which_friction_turns():
     speed = np.concatenate([np.zeros(10), np.full(50, 0.01), np.full(50, -0.1)])[:, None]
-    away = away_from_reversals(speed, 0.01, 0.02, 0.002)[:, 0]
+    away = away_from_reversals(speed, 0.01, 0.02, 0.002, 1e-3)[:, 0]
     # 0.1 mrad a sample forwards, so the tenth counts again; backwards 1 mrad, so the window alone.
     assert np.flatnonzero(away).tolist() == [*range(19, 58), *range(62, 110)]
-    assert away_from_reversals(speed, 0.01, 0.0, 0.002)[10:].all()
-    assert turning_reach(0.02, 0.002) == pytest.approx(0.52)
-    assert turning_reach(0.0, 0.002) == 0.0
+    assert away_from_reversals(speed, 0.01, 0.0, 0.002, 0.0)[10:].all()
+    assert turning_reach(0.02, 0.002, 1e-3) == pytest.approx(0.52)
+    assert turning_reach(0.0, 0.002, 0.0) == 0.0
 
 
 # ---- settings and filters ----
@@ -67,13 +67,21 @@ def test_unset_settings_are_those_of_the_paper_as_far_as_the_rate_carries_them()
     plain = SignalSettings()
     assert (plain.cutoff, plain.decimate, plain.reversal, plain.order) == (10.0, 2.0, 0.05, 4)
     assert (plain.slow, plain.settled(1000.0).slow_rad_s) == (0.0, 0.0)
+    assert (plain.turning, plain.settled(1000.0).turning_rad) == (1e-3, 1e-3)
+    assert SignalSettings(reversal_s=0.0).turning == 0.0
     assert (plain.row_rate_hz, plain.edge) == (5.0, 0.2)
     at_1khz, at_40hz, at_10hz = (plain.settled(rate) for rate in (1000.0, 40.0, 10.0))
     assert (at_1khz.cutoff_hz, at_1khz.decimate_hz, at_1khz.reversal_s) == (10.0, 2.0, 0.05)
     assert (at_40hz.cutoff_hz, at_40hz.decimate_hz) == (8.0, 2.0)
     assert (at_10hz.cutoff_hz, at_10hz.decimate_hz) == (2.0, pytest.approx(2.0 / 1.5))
     stated = SignalSettings(
-        cutoff_hz=4.0, decimate_hz=3.0, reversal_s=0.01, slow_rad_s=0.02, rate_hz=7.0, edge_s=0.3
+        cutoff_hz=4.0,
+        decimate_hz=3.0,
+        reversal_s=0.01,
+        turning_rad=0.003,
+        slow_rad_s=0.02,
+        rate_hz=7.0,
+        edge_s=0.3,
     )
     assert stated.settled(1000.0) == stated
     assert (stated.row_rate_hz, stated.edge) == (7.0, 0.3)
