@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -125,7 +124,7 @@ def limits(values: Sequence[Floats], *, pad: float = 0.04) -> tuple[float, float
 def thin(x: Floats, y: Floats, points: int = 1000) -> tuple[Floats, Floats]:
     """At most `points` of the samples (n,), n > points, in their order: both extremes of each stretch.
 
-    The samples are cut into points / 2 stretches of equal number; of each, the lowest and the highest sample
+    The samples are cut into points / 2 stretches at most, of equal number; of each, the lowest and the highest sample
     stay at their own x, so a spike of a single sample survives. The first and the last sample stay too.
     Non-finite samples are left out.
     """
@@ -134,12 +133,10 @@ def thin(x: Floats, y: Floats, points: int = 1000) -> tuple[Floats, Floats]:
         x, y = x[good], y[good]
     if len(x) <= points:
         return x, y
-    stretches = max((points - 2) // 2, 1)
-    edges = np.linspace(0, len(x), stretches + 1).astype(np.int64)
-    lowest = np.empty(stretches, dtype=np.int64)
-    highest = np.empty(stretches, dtype=np.int64)
-    for k, (low, high) in enumerate(pairwise(edges)):
-        lowest[k] = low + int(np.argmin(y[low:high]))
-        highest[k] = low + int(np.argmax(y[low:high]))
-    kept = np.union1d(np.concatenate([lowest, highest]), np.array([0, len(x) - 1]))
+    width = -(-len(x) // max((points - 2) // 2, 1))
+    first = np.arange(0, len(x), width)
+    # The last stretch is filled up with its last sample.
+    table = np.append(y, np.full(len(first) * width - len(y), y[-1])).reshape(-1, width)
+    extremes = [first + table.argmin(axis=1), first + table.argmax(axis=1)]
+    kept = np.unique(np.minimum(np.concatenate([*extremes, [0, len(x) - 1]]), len(x) - 1))
     return x[kept], y[kept]
