@@ -215,7 +215,7 @@ def delay_alone(
     problem : stacked rows of all records with the delays `before` [s] of these `records`. shifted : the same rows with
     delays `SHIFT_S` longer and shorter.
 
-    Raises DataError for rows that do not determine all parameters.
+    Raises DataError for rows that do not determine all parameters, or no delay.
     """
     problem.require_rank()
     values = weighted_solution(problem)[0]
@@ -241,6 +241,8 @@ def delay_alone(
             for i, joint in places
             if i == k and f"delay {k} {joint}" in found
         }
+        if not mine:
+            raise DataError(f"no motor torque of {problem.record_names[k]} changes with its delay")
         steps, stds = np.array(list(mine.values())).T
         delays.append(_together(list(mine), start + steps, stds, "from the base model"))
     return delays

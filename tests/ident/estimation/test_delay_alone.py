@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fri.errors import DataError
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.validate import validate
+from ident.rows.delay import delay_alone
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session, true_base
 
@@ -57,3 +59,14 @@ def test_a_punctual_channel_is_not_late_and_its_interval_is_in_the_deviations() 
     assert all(delay is not None and delay.seconds == 0.0 and delay.std > 0.0 for delay in delays)
     place = found.base.names.index("Ia4")
     assert found.estimate.std[place] > known.estimate.std[place]
+
+
+def test_torques_of_an_arm_at_rest_have_no_delay_to_tell() -> None:
+    rows = estimated(0.0).problem
+    still = replace(
+        rows, groups=tuple(replace(group, matrix=group.matrix * 0.0 + 1.0) for group in rows.groups)
+    )
+    with pytest.raises(DataError):
+        delay_alone(still, [0], (still, still), [0.0])
+    with pytest.raises(DataError, match="changes with its delay"):
+        delay_alone(rows, [0], (rows, rows), [0.0])
