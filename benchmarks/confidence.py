@@ -5,10 +5,10 @@
     python -m benchmarks.confidence --check other/results.jsonl --check other_cases --diagram confidence.svg
 
 Reads the findings of campaigns of `benchmarks.discovery` (their `results.jsonl`) and of `benchmarks.mujoco_arms`
-(their folder). The weights of `ident/diagnosis/confidence.yaml` are those of a logistic regression with the signs of
-`ident.diagnosis.confidence.SIGNS`, each generator with the same weight, and a pull to `START` chosen by
-cross-validation over whole cases. The reliability printed for the fit is that of cross-validation too. `--check`
-judges the confidence as the diagnoses stated it.
+(their folder), for the fit with the names that were doubted. The weights of `ident/diagnosis/confidence.yaml` are those
+of a logistic regression with the signs of `ident.diagnosis.confidence.SIGNS`, each generator with the same weight, and
+a pull to `START` chosen by cross-validation over whole cases. The reliability printed for the fit is that of
+cross-validation too. `--check` judges the confidence as the diagnoses stated it.
 """
 
 from __future__ import annotations
@@ -52,11 +52,15 @@ class Said:
     right: bool
 
 
-def read(path: Path) -> list[Said]:
-    """All findings of a campaign about what is in the catalogue, but for habits of the healthy arm."""
+def read(path: Path, *, doubted: bool = False) -> list[Said]:
+    """All findings of a campaign about what is in the catalogue, but for habits of the healthy arm; of healthy twins,
+    too.
+
+    doubted : with the names that were more likely wrong.
+    """
     said = []
-    for case, hidden, traits, findings in _mujoco(path) if path.is_dir() else _own(path):
-        for finding in findings:
+    for case, hidden, traits, told in _mujoco(path) if path.is_dir() else _own(path):
+        for finding in [*told["findings"], *(told.get("doubted", ()) if doubted else ())]:
             right = any(names(finding, one) for one in hidden)
             if right or not habitual(finding, traits):
                 label = f"{finding['cause']}{finding['joints']}"
@@ -65,29 +69,31 @@ def read(path: Path) -> list[Said]:
     return said
 
 
-Content = tuple[str, list[dict[str, Any]], Mapping[str, Any], list[dict[str, Any]]]
+Content = tuple[str, list[dict[str, Any]], Mapping[str, Any], dict[str, Any]]
 
 
 def _own(path: Path) -> list[Content]:
-    found = []
+    found: list[Content] = []
     for result in read_results(path):
         if "crash" not in result:
             hidden = [{**one, "also": one.get("also", ())} for one in result["truth"]["hidden"]]
             for one in hidden:
                 # A joint of 0 is the whole arm.
                 one["joints"] = [joint for joint in one["joints"] if joint]
-            found.append((result["id"], hidden, {}, result["diagnosis"]["findings"]))
+            found.append((result["id"], hidden, {}, result["diagnosis"]))
     return found
 
 
 def _mujoco(path: Path) -> list[Content]:
-    found = []
+    found: list[Content] = []
     for verdict in sorted(path.glob("*/verdict.json")):
         folder = verdict.parent
-        if (folder / "diagnosis" / "diagnosis.json").is_file():
-            truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
-            told = json.loads((folder / "diagnosis" / "diagnosis.json").read_text(encoding="utf-8"))
-            found.append((folder.name, truth["hidden"], truth["traits"], told["findings"]))
+        truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+        for place, hidden in ((folder, truth["hidden"]), (folder / "twin", [])):
+            file = place / "diagnosis" / "diagnosis.json"
+            if file.is_file():
+                told = json.loads(file.read_text(encoding="utf-8"))
+                found.append((folder.name, hidden, truth["traits"], told))
     return found
 
 
@@ -167,7 +173,7 @@ def table(sources: Sequence[str], p: Floats, right: Floats) -> str:
 def main(campaigns: tuple[Path, ...], write: bool, check: tuple[Path, ...], diagram: Path | None) -> None:
     """Fit the confidence to campaigns, or check it on others."""
     if campaigns:
-        _fit([one for path in campaigns for one in read(path)], write)
+        _fit([one for path in campaigns for one in read(path, doubted=True)], write)
     if check:
         said = [one for path in check for one in read(path)]
         p, right = (np.array([getattr(one, key) for one in said], float) for key in ("confidence", "right"))

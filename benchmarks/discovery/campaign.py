@@ -156,7 +156,7 @@ def _one(plan: Plan, seed: int, kind: str, cause: str | None, encoder: Encoder) 
     result["seconds"] = seconds
     result["verdict"] = judge(diagnosis, case.hidden, clean).to_dict()
     result["diagnosis"] = {
-        key: diagnosis[key] for key in ("findings", "nameless", "unexplained", "extension", "gain")
+        key: diagnosis[key] for key in ("findings", "doubted", "nameless", "unexplained", "extension", "gain")
     }
     if plan.discard and case.hidden:
         _discard(store, case)

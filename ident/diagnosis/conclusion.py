@@ -51,7 +51,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
     evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])
     remainders = find_remainders(bench.dictionary, evidence, settings, task.null)
     findings = doubted(task, state, kept, remainders)
-    if not all(believable(f.grounds) for f in findings):
+    doubts = [f for f in findings if not believable(f.grounds)]
+    if doubts:
         # A name hardly believed is no finding; what it explained is left to the remainders.
         kept = [one for one, f in zip(kept, findings, strict=True) if believable(f.grounds)]
         findings = [f for f in findings if believable(f.grounds)]
@@ -82,6 +83,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
     if not by_identify:
         members, after, refuted = _predicting(task, state, baseline, members, after)
     findings = [contradicted(f) if any(f is r for r in refuted) else f for f in findings]
+    doubts += [f for f in findings if not believable(f.grounds)]
     findings = [f for f in findings if believable(f.grounds)]
     findings += [*state.timing, *worn]
     loss = sample_loss(list(task.sessions))
@@ -128,6 +130,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         model_number=nominal.structure.model,
         findings=tuple(f for f in findings if not is_character[id(f)]),
         character=tuple(f for f in findings if is_character[id(f)]),
+        doubted=tuple(doubts),
         nameless=nameless,
         extension=added,
         unexplained=tuple(

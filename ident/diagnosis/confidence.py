@@ -36,7 +36,7 @@ class Grounds:
     felt : share of the held-out error of its rows that the claim takes away. one_block : 1 if one block shows all of
     it. worse : 1 if another row becomes worse beyond chance. rest : unexplained gain in its rows over its own.
     replaceable : share of its gain explained by unnamed functions of the motion. habitual : 1 for a cause that healthy
-    drives have. company : number of other claims.
+    drives have. company : number of claims of more gain.
     """
 
     gain: float

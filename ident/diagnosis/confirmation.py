@@ -68,7 +68,7 @@ def confirmed(task: Task, state: State) -> list[Confirmed]:
             continue
         untested = _untested(claim, finding) or hardly
         grounds = _grounds(claim, finding, bench, without, after, fallen, untested, seed)
-        grounds = replace(grounds, company=float(len(claims) - 1))
+        grounds = replace(grounds, company=float(sum(c.gain > claim.gain for c in claims)))
         most = 1.0 if _plain(claim, finding, bench, grounds, fallen) else _OPEN
         kept.append(Confirmed(claim, finding, grounds, most))
     return kept
@@ -126,7 +126,7 @@ def confirmed_delay(task: Task, after: State, claim: Claim, rest: tuple[float, f
     low, high = finding.evidence.gain_interval_95
     grounds = replace(
         _grounds(claim, finding, bench, before, now, (low, high), False, seed),
-        company=float(len(selection.claims)),
+        company=float(sum(c.gain > claim.gain for c in selection.claims)),
     )
     confidence = min(claim.confidence, probability(grounds), 1.0 if _seen(low, grounds) else _OPEN)
     return replace(finding, confidence=confidence, grounds=grounds.to_dict())

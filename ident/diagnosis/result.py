@@ -179,8 +179,8 @@ class Diagnosis(Tabular):
     """Everything that was found; prints itself.
 
     findings : changes against the reference, or what no healthy arm of the kind has. character : what every such drive
-    has and the base model lacks. nameless : fitted terms without a name. unexplained : remainders that could not be
-    fitted. extension : `cause(joints)` of all in the extended model.
+    has and the base model lacks. doubted : names more likely wrong than right. nameless : fitted terms without a name.
+    unexplained : remainders that could not be fitted. extension : `cause(joints)` of all in the extended model.
     base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
     changes : change of the base parameters by the extension, in their standard deviations.
     notes : sentences on limits of the data. data : broken channels, left out.
@@ -205,6 +205,7 @@ class Diagnosis(Tabular):
     simulation_extended: SimulationError | None = None
     notes: tuple[str, ...] = ()
     character: tuple[Finding, ...] = ()
+    doubted: tuple[Finding, ...] = ()
     nameless: tuple[Nameless, ...] = ()
     extension: tuple[str, ...] = ()
     residuals: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict, repr=False)
@@ -271,6 +272,7 @@ class Diagnosis(Tabular):
             "data": [broken.to_dict() for broken in self.data],
             "findings": [finding.to_dict() for finding in self.findings],
             "character": [finding.to_dict() for finding in self.character],
+            "doubted": [finding.to_dict() for finding in self.doubted],
             "nameless": [term.to_dict() for term in self.nameless],
             "unexplained": [
                 {
