@@ -93,6 +93,9 @@ def _mujoco(path: Path) -> list[Content]:
             file = place / "diagnosis" / "diagnosis.json"
             if file.is_file():
                 told = json.loads(file.read_text(encoding="utf-8"))
+                details = file.with_name("details.json")
+                if details.is_file():
+                    told["doubted"] = json.loads(details.read_text(encoding="utf-8")).get("doubted", [])
                 found.append((folder.name, hidden, truth["traits"], told))
     return found
 

@@ -272,7 +272,6 @@ class Diagnosis(Tabular):
             "data": [broken.to_dict() for broken in self.data],
             "findings": [finding.to_dict() for finding in self.findings],
             "character": [finding.to_dict() for finding in self.character],
-            "doubted": [finding.to_dict() for finding in self.doubted],
             "nameless": [term.to_dict() for term in self.nameless],
             "unexplained": [
                 {

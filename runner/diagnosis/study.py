@@ -111,6 +111,7 @@ class Study:
             "rows": list(self.gains),
             "base_parameters": list(self.moved),
             "notes": list(self.notes),
+            "doubted": [finding.to_dict() for finding in self.diagnosis.doubted],
             "torque_errors": list(self.torque_errors),
             "look_alikes": [pair.to_dict() for pair in self.pairs],
             "deciding_motions": [offer.to_dict() for offer in self.offers],

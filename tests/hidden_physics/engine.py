@@ -64,7 +64,8 @@ def commissioned(
 
 
 def diagnosed(sessions: Sessions, reference: Path | None) -> tuple[dict[str, Any], float]:
-    """Content of `diagnosis.json`, and the processor time that it took [s], reading the logs included."""
+    """Content of `diagnosis.json` with the doubted names, and the processor time that it took [s], reading the logs
+    included."""
     chain, data = _arm()
     began = time.process_time()
     result = diagnose(
@@ -74,7 +75,8 @@ def diagnosed(sessions: Sessions, reference: Path | None) -> tuple[dict[str, Any
         arm=data,
         reference=None if reference is None else Reference.of(read_model(reference)),
     )
-    return result.to_dict(), time.process_time() - began
+    doubted = [finding.to_dict() for finding in result.doubted]
+    return {**result.to_dict(), "doubted": doubted}, time.process_time() - began
 
 
 def main() -> None:
