@@ -18,7 +18,8 @@ from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.diagnosis.tolerances import Tolerance, tolerances
+from ident.diagnosis.tolerances import HABITUAL, Tolerance, tolerances
+from ident.effects import Shape
 from ident.estimators.estimate import normal_tail
 
 log = logging.getLogger(__name__)
@@ -283,15 +284,26 @@ class State:
         return False
 
     def usual(self, trial: Trial) -> float:
-        """Upper limit of the gain of such a trial on a healthy arm, in sessions with as much information on it."""
+        """Upper limit of the gain of such a trial on a healthy arm, in sessions with as much information on it.
+
+        Few healthy days may be alike by chance, so it is no less than that of the usual change of a scale.
+        """
         key = trial.candidate.key
-        limit = self.null.get(key, 0.0)
+        limit, least = self.null.get(key, 0.0), self._scaled(trial.candidate)
         shape = self.dictionary.nearest(trial)
         before = self.shown.get(key, {}).get(shape, 0.0)
         if not limit or before <= 0.0:
-            return limit
+            return max(limit, least)
         now = self.dictionary.information(trial.candidate).get(shape, 0.0)
-        return limit * float(np.clip(now / before, *_INFORMATION))
+        return max(limit * float(np.clip(now / before, *_INFORMATION)), least)
+
+    def _scaled(self, candidate: Candidate) -> float:
+        """Gain by the largest usual change from day to day of a cause that is a scale, 0 for others and without a
+        reference."""
+        if not candidate.effect.usual_change or not self.null:
+            return 0.0
+        largest = HABITUAL * max(candidate.effect.usual_change, self.dictionary.nominal.arm.gain_std)
+        return self.dictionary.information(candidate).get(repr(Shape()), 0.0) * largest**2
 
     def refined(self, trial: Trial) -> Trial:
         """The trial with its shape at the best fit, unless cross-validation contradicts that shape."""

@@ -21,11 +21,11 @@ from ident.effects.motion import ArmMotion
 _KNOWN_DELAY = 0.4
 # The same for a stiffness behind published motors.
 _KNOWN_COMPLIANCE = 0.4
-# Largest change from day to day, in standard deviations.
-_HABITUAL = 3.0
 # Standard deviation of a presliding length from day to day, as a share of it.
 _LENGTH_STD = 0.2
 
+HABITUAL = 3.0
+"""Largest change from day to day, in standard deviations."""
 GAIN = "gain"
 """Name of the tolerated deviation of a torque sensor's gain, before the number of its joint."""
 
@@ -62,13 +62,13 @@ def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSe
                 found.append(Tolerance(f"compliance {joint + 1}", rows, 1.0, size, (ELASTICITY.cause, joint)))
     if evidence.compared:
         # Without a reference the gains of the sensors are hardly distinguishable from a scale of all masses.
-        size = _HABITUAL * nominal.arm.gain_std
+        size = HABITUAL * nominal.arm.gain_std
         found += [
             Tolerance(f"{GAIN} {j + 1}", rows, 1.0, size, (SENSOR_GAIN.cause, j))
             for j, rows in gain_rows(dictionary).items()
         ]
         found += [
-            Tolerance(f"presliding {j + 1}", rows, 1.0, _HABITUAL * _LENGTH_STD, (PRESLIDING.cause, j))
+            Tolerance(f"presliding {j + 1}", rows, 1.0, HABITUAL * _LENGTH_STD, (PRESLIDING.cause, j))
             for j, rows in _presliding_rows(dictionary).items()
         ]
     return found
