@@ -370,7 +370,8 @@ def _reference(
     base, known = usual.base, [_known(day, usual) for day in days]
     rms = {side: np.mean([day.torque_rms[side] for day in days], axis=0) for side in usual.torque_rms}
     changing = [_known(day, usual) for day in habits] or known
-    variance = habit(base.names, [values for values, _ in changing], [c for _, c in changing], rms)
+    efforts = base.structure.chain.efforts()
+    variance = habit(base.names, [values for values, _ in changing], [c for _, c in changing], rms, efforts)
     precision, pull = np.zeros((len(base), len(base))), np.zeros(len(base))
     for values, covariance in known:
         # A mean weighted by each day's own uncertainty alone would turn their changes into errors of all parameters.

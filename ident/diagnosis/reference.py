@@ -284,11 +284,13 @@ def habit(
     days: Sequence[Floats],
     covariances: Sequence[Floats],
     torque_rms: Mapping[str, Floats],
+    efforts: Floats | None = None,
 ) -> Floats:
     """Variance (p,) of healthy parameters from day to day around their mean.
 
     days, covariances : parameters (p,) and covariance (p, p) of each day, NaN for the parameters of another payload.
-    torque_rms : of the rows by side, (n,) [Nm].
+    torque_rms : of the rows by side, (n,) [Nm]. efforts : (n,) largest torques [Nm]; a sensor's zero may go with its
+        range and not with the torque of a motion.
     Joints of an arm have the same habits, so all parameters of a symbol share one relative variance: the scatter of the
     days beyond their own uncertainty, and the usual change as some further changes. Two days of a 7-joint arm are
     seven changes of its Coulomb friction. What the model lacks bends the parameters differently with each motion, those
@@ -319,12 +321,31 @@ def habit(
         total = max(float(np.sum(scatter / scale[telling] ** 2)), 0.0)
         share = (USUAL_CHANGES * usual[mine][0] ** 2 + total) / (USUAL_CHANGES + changes)
         variance[mine] = share * scale[mine] ** 2
+        if group in _OFFSETS and efforts is not None:
+            ranges = efforts[[joint_of(name) for name, at in zip(names, mine, strict=True) if at]]
+            beyond = squares[mine] - (count[mine] - 1) * own[mine]
+            if _goes_with_ranges(beyond, scale[mine], ranges):
+                by_range = float(np.sum(beyond / ranges**2)) / int(np.sum(count[mine] - 1)) * ranges**2
+                least = USUAL_CHANGES * usual[mine] ** 2 / (USUAL_CHANGES + changes) * scale[mine] ** 2
+                variance[mine] = np.maximum(by_range, least)
         expected = own[mine] + variance[mine]
         excess = squares[mine] / np.maximum(expected, 1e-300)
         common = max((_ALIKE + excess.sum()) / (_ALIKE + np.sum(count[mine] - 1)), 1.0)
         each = (_ALIKE * common + excess) / (_ALIKE + count[mine] - 1)
         variance[mine] += np.maximum(each - 1.0, 0.0) * own[mine]
     return variance
+
+
+def _goes_with_ranges(beyond: Floats, scale: Floats, ranges: Floats) -> bool:
+    """Whether the scatter (k,) of offsets beyond their uncertainty is more likely a share of the sensors' ranges (k,)
+    than of the torques `scale` (k,)."""
+    shares = [float(np.sum(beyond / sizes**2)) for sizes in (ranges, scale)]
+    if min(shares) <= 0.0:
+        return False
+    by_range, by_torque = (
+        np.sum(np.log(share * sizes**2)) for share, sizes in zip(shares, (ranges, scale), strict=True)
+    )
+    return bool(by_range < by_torque)
 
 
 def joint_of(name: str) -> int:

@@ -385,6 +385,14 @@ class Chain(Tabular):
         assert self.link_placements is not None
         return _transformed(inertial, np.linalg.inv(self.link_placements))
 
+    def efforts(self) -> Floats | None:
+        """Largest torques (n,) [Nm] by the URDF; None without one, or without that of every joint."""
+        if self.urdf is None:
+            return None
+        stated = {joint.name: joint.effort for joint in read_urdf(self.urdf).joints}
+        found = np.array([stated.get(name) or np.nan for name in self.joint_names])
+        return found if np.isfinite(found).all() else None
+
     def urdf_inertials(self) -> Floats:
         """(n, 10) inertial parameters of the URDF, in modified-DH frames.
 

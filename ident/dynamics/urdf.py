@@ -34,6 +34,7 @@ class Joint:
     """One joint: kind ("revolute", "prismatic", "fixed"), parent and child, origin (4, 4), unit axis (3,).
 
     mimic : name of the joint it follows, or None. limits : lower and upper position [rad or m], or None.
+    effort : largest torque or force [Nm or N], or None.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Joint:
     axis: Floats
     mimic: str | None = None
     limits: tuple[float, float] | None = None
+    effort: float | None = None
 
     @property
     def movable(self) -> bool:
@@ -350,4 +352,5 @@ def _joint(element: ElementTree.Element, place: str) -> Joint:
         (float(_numbers(limit, "lower", (0.0,), where)[0]), float(_numbers(limit, "upper", (0.0,), where)[0]))
         if bounded
         else None,
+        (None if limit is None else float(_numbers(limit, "effort", (0.0,), where)[0])) or None,
     )

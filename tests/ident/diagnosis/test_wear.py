@@ -145,6 +145,18 @@ def test_habit_of_an_offset_is_measured_by_the_torque_of_its_rows() -> None:
     assert np.sqrt(alone) == pytest.approx([0.1])
 
 
+def test_zeros_of_sensors_may_scatter_with_their_ranges() -> None:
+    names = tuple(f"offl{k}" for k in range(1, 7))
+    ranges, rms = np.array([150.0, 150.0, 150.0, 28.0, 28.0, 28.0]), {"joint": np.full(6, 2.0)}
+    rng = np.random.default_rng(0)
+    days = [rng.uniform(-0.004, 0.004, 6) * ranges for _ in range(2)]
+    own = [np.eye(6) * 1e-8] * 2
+    found = np.sqrt(habit(names, days, own, rms, ranges)) / ranges
+    assert np.all((found > 0.5 * 0.0023) & (found < 2.5 * 0.0023))
+    calm = [np.zeros(6), 1e-3 * rng.normal(size=6)]
+    assert habit(names, calm, own, rms, ranges) == pytest.approx(habit(names, calm, own, rms), rel=0.02)
+
+
 def test_parameters_bent_by_each_motion_scatter_with_their_uncertainty() -> None:
     """First moments near zero: no share of their value tells how far an incomplete model moves them."""
     names = tuple(f"MX{k}" for k in range(2, 8))
