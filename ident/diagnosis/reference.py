@@ -339,6 +339,8 @@ def habit(
 def _goes_with_ranges(beyond: Floats, scale: Floats, ranges: Floats) -> bool:
     """Whether the scatter (k,) of offsets beyond their uncertainty is more likely a share of the sensors' ranges (k,)
     than of the torques `scale` (k,)."""
+    if np.min(scale) <= 0.0:
+        return False
     shares = [float(np.sum(beyond / sizes**2)) for sizes in (ranges, scale)]
     if min(shares) <= 0.0:
         return False

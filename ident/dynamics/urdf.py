@@ -352,5 +352,14 @@ def _joint(element: ElementTree.Element, place: str) -> Joint:
         (float(_numbers(limit, "lower", (0.0,), where)[0]), float(_numbers(limit, "upper", (0.0,), where)[0]))
         if bounded
         else None,
-        (None if limit is None else float(_numbers(limit, "effort", (0.0,), where)[0])) or None,
+        _effort(limit),
     )
+
+
+def _effort(limit: ElementTree.Element | None) -> float | None:
+    """The largest torque, if it is a positive number: zero, `inf` and words stand for unknown in many files."""
+    try:
+        value = float("nan" if limit is None else limit.get("effort", "nan"))
+    except ValueError:
+        return None
+    return value if 0.0 < value < np.inf else None

@@ -292,3 +292,10 @@ def test_an_angle_near_a_quarter_turn_is_one_and_half_a_turn_is_positive(
     angle: float, snapped: float
 ) -> None:
     assert _snap(angle, 0.001) == snapped
+
+
+@pytest.mark.parametrize("unknown", ['effort="0"', 'effort="inf"', 'effort="much"', ""])
+def test_largest_torques_are_known_of_all_joints_or_of_none(unknown: str) -> None:
+    text = urdf(UPRIGHT)
+    np.testing.assert_array_equal(Chain.from_urdf(text).efforts(), np.full(7, 10.0))
+    assert Chain.from_urdf(text.replace('effort="10"', unknown, 1)).efforts() is None
