@@ -414,7 +414,7 @@ def test_a_commanded_motion_without_error_is_the_measured_one() -> None:
 
 
 @pytest.mark.parametrize("extra", range(9))
-def test_a_stretch_of_a_few_samples_between_gaps_gives_no_row_and_noerror(extra: int) -> None:
+def test_a_stretch_of_a_few_samples_between_gaps_gives_no_row_and_no_error(extra: int) -> None:
     session = arm.session(period_s=4.0, sensors=arm.Sensors(joint=0.1, motor=0.1))
     cut = round(SignalSettings().settled(1.0 / session.joint.period_s).edge / session.joint.period_s)
     # Around t = 8.2 s, a time of a row; the gaps are longer than any bridge.

@@ -181,7 +181,7 @@ def made(torque, matrix, even) -> ClassRows:
     return ClassRows(matrix, torque, np.ones(count), whole, block, (), (slice(0, count),))
 
 
-def test_a_loud_class_has_little_weight_in_thefit():
+def test_a_loud_class_has_little_weight_in_the_fit():
     random = np.random.default_rng(0)
     matrix = random.normal(size=(400, 1))
     even = np.arange(400) % 2 == 0
