@@ -67,8 +67,7 @@ def confirmed(task: Task, state: State) -> list[Confirmed]:
         if _refuted(claim, finding, bench, fallen, hardly):
             continue
         untested = _untested(claim, finding) or hardly
-        grounds = _grounds(claim, finding, bench, without, after, fallen, untested, seed)
-        grounds = replace(grounds, company=float(sum(c.gain > claim.gain for c in claims)))
+        grounds = _grounds(claim, claims, finding, bench, without, after, fallen, untested, seed)
         most = 1.0 if _plain(claim, finding, bench, grounds, fallen) else _OPEN
         kept.append(Confirmed(claim, finding, grounds, most))
     return kept
@@ -124,10 +123,7 @@ def confirmed_delay(task: Task, after: State, claim: Claim, rest: tuple[float, f
     p_value = fisher_tail((delay.value / delay.std) ** 2, 1, USUAL_DAYS + sets - 1)
     finding = replace(finding, evidence=replace(finding.evidence, p_value=p_value))
     low, high = finding.evidence.gain_interval_95
-    grounds = replace(
-        _grounds(claim, finding, bench, before, now, (low, high), False, seed),
-        company=float(sum(c.gain > claim.gain for c in selection.claims)),
-    )
+    grounds = _grounds(claim, selection.claims, finding, bench, before, now, (low, high), False, seed)
     confidence = min(claim.confidence, probability(grounds), 1.0 if _seen(low, grounds) else _OPEN)
     return replace(finding, confidence=confidence, grounds=grounds.to_dict())
 
@@ -177,6 +173,7 @@ def _seen(low: float, grounds: Grounds) -> bool:
 
 def _grounds(
     claim: Claim,
+    claims: Sequence[Claim],
     finding: Finding,
     bench: DiagnosisBench,
     without: HeldOut,
@@ -185,7 +182,7 @@ def _grounds(
     untested: bool,
     seed: int,
 ) -> Grounds:
-    """The grounds from the rows fitted and, unless untested, held out."""
+    """The grounds from the rows fitted and, unless untested, held out. claims : of the selection."""
     effect, shown, (low, high) = claim.trial.candidate.effect, finding.evidence, fallen
     least = effect.evidence_factor * bench.evidence.settings.least_gain
     sure = min(max(claim.confidence, 1e-6), 1.0 - 1e-6)
@@ -202,6 +199,7 @@ def _grounds(
         one_block=float(not untested and not spread_out(without, after, list(claim.trial.rows))),
         worse=float(not untested and bool(worse_rows(without, after, seed))),
         habitual=float(effect.character),
+        company=float(sum(other.gain > claim.gain for other in claims)),
     )
 
 

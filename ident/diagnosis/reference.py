@@ -324,8 +324,8 @@ def habit(
         if group in _OFFSETS and efforts is not None:
             ranges = efforts[[joint_of(name) for name, at in zip(names, mine, strict=True) if at]]
             beyond = squares[mine] - (count[mine] - 1) * own[mine]
-            if _goes_with_ranges(beyond, scale[mine], ranges):
-                by_range = float(np.sum(beyond / ranges**2)) / int(np.sum(count[mine] - 1)) * ranges**2
+            if of_ranges := _share_of_ranges(beyond, scale[mine], ranges):
+                by_range = of_ranges / int(np.sum(count[mine] - 1)) * ranges**2
                 least = USUAL_CHANGES * usual[mine] ** 2 / (USUAL_CHANGES + changes) * scale[mine] ** 2
                 variance[mine] = np.maximum(by_range, least)
         expected = own[mine] + variance[mine]
@@ -336,18 +336,16 @@ def habit(
     return variance
 
 
-def _goes_with_ranges(beyond: Floats, scale: Floats, ranges: Floats) -> bool:
-    """Whether the scatter (k,) of offsets beyond their uncertainty is more likely a share of the sensors' ranges (k,)
-    than of the torques `scale` (k,)."""
+def _share_of_ranges(beyond: Floats, scale: Floats, ranges: Floats) -> float:
+    """Scatter (k,) of offsets beyond their uncertainty, summed in shares of the sensors' ranges (k,); 0 if shares of
+    the torques `scale` (k,) are more likely."""
     if np.min(scale) <= 0.0:
-        return False
-    shares = [float(np.sum(beyond / sizes**2)) for sizes in (ranges, scale)]
-    if min(shares) <= 0.0:
-        return False
-    by_range, by_torque = (
-        np.sum(np.log(share * sizes**2)) for share, sizes in zip(shares, (ranges, scale), strict=True)
-    )
-    return bool(by_range < by_torque)
+        return 0.0
+    of_ranges, of_torques = (float(np.sum(beyond / sizes**2)) for sizes in (ranges, scale))
+    if min(of_ranges, of_torques) <= 0.0:
+        return 0.0
+    likelier = np.sum(np.log(of_ranges * ranges**2)) < np.sum(np.log(of_torques * scale**2))
+    return of_ranges if likelier else 0.0
 
 
 def joint_of(name: str) -> int:

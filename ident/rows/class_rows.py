@@ -47,9 +47,8 @@ class ClassRows:
         found = self.measured.copy()
         for some in self.stretches:
             speed = self.speed[some, None]
-            found[some] &= away_from_reversals(speed, BIN_S, bins * BIN_S, standstill_rad_s, turning_rad)[
-                :, 0
-            ]
+            away = away_from_reversals(speed, BIN_S, bins * BIN_S, standstill_rad_s, turning_rad)
+            found[some] &= away[:, 0]
         return found
 
 
