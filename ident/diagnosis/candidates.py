@@ -317,6 +317,23 @@ class Dictionary:
             }
         return self._information[candidate.key]
 
+    def scores(self, candidate: Candidate) -> dict[str, Score]:
+        """Score of each shape of a candidate's grid beside the present columns, by the shape as text; empty for
+        events."""
+        effect = candidate.effect
+        entries = [] if effect.repeats or effect.step or effect.event else self._prepared(candidate)
+        found = {
+            repr(shape): self.measure(candidate, rows, len(entries), known) for shape, rows, known in entries
+        }
+        return {shape: score for shape, score in found.items() if np.isfinite(score.gain)}
+
+    def scored(self, candidate: Candidate, shape: str) -> Score | None:
+        """Score of a shape of the grid beside the present columns; None without it."""
+        for one, rows, known in self._kept.get(candidate.key, ()):
+            if repr(one) == shape:
+                return self.measure(candidate, rows, 1, known)
+        return None
+
     def nearest(self, trial: Trial) -> str:
         """The shape of the grid nearest to a trial's, empty without one."""
         shapes = [shape for shape, *_ in self._kept.get(trial.candidate.key, ())]

@@ -88,7 +88,7 @@ class _Set:
     accepted: list[Trial] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.state = State(self.bench.dictionary, self.bench.evidence, self.settings, {})
+        self.state = State(self.bench.dictionary, self.bench.evidence, self.settings)
 
     def found(self) -> dict[tuple[str, int], Trial]:
         """The best shape of each candidate beside what was accepted."""

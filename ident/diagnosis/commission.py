@@ -31,6 +31,7 @@ from ident.diagnosis.reference import DELAY_STD_S, USUAL_CHANGES, USUAL_DAYS, Re
 from ident.diagnosis.selection import gains, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.tolerances import gain_rows
+from ident.diagnosis.usual_sizes import scores, usual_sizes
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
 from ident.effects.motion import dahl
@@ -251,6 +252,7 @@ def commission(
     days = [_day(known, recordings, settings, base) for recordings in recorded]
     null: dict[tuple[str, int], float] = {}
     shown: dict[tuple[str, int], dict[str, float]] = {}
+    tables = []
     for number, recordings in enumerate(recorded):
         others = [day for k, day in enumerate(days) if k != number]
         rest = _reference(others, known, robot, parts[0], {}, days) if others else None
@@ -258,6 +260,7 @@ def commission(
         own = gains(bench.dictionary, bench.evidence, settings)
         for key, gain in (own | remainder_gains(bench.dictionary, bench.evidence)).items():
             null[key] = null.get(key, 0.0) + gain / len(parts)
+        tables.append(scores(bench.dictionary))
         for candidate in bench.dictionary.candidates:
             mean = shown.setdefault(candidate.key, {})
             for shape, value in bench.dictionary.information(candidate).items():
@@ -269,6 +272,7 @@ def commission(
         found,
         model=replace(found.model, provenance=provenance),
         shown=shown,
+        usual=usual_sizes(tables),
         compliance_std=compliance_std([one.compliance for one in several]),
     )
 

@@ -49,7 +49,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
     baseline = baseline or Baseline.of(bench, nuisance)
     kept = [one for one in confirmed(task, state) if not is_level(one.claim)]
     evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])
-    remainders = find_remainders(bench.dictionary, evidence, settings, task.null)
+    remainders = find_remainders(bench.dictionary, evidence, settings, task.limits)
     findings = doubted(task, state, kept, remainders)
     doubts = [f for f in findings if not believable(f.grounds)]
     if doubts:
@@ -57,7 +57,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         kept = [one for one, f in zip(kept, findings, strict=True) if believable(f.grounds)]
         findings = [f for f in findings if believable(f.grounds)]
         evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])
-        remainders = find_remainders(bench.dictionary, evidence, settings, task.null)
+        remainders = find_remainders(bench.dictionary, evidence, settings, task.limits)
     worn = []
     if task.reference is not None:
         shown = held_out(evidence, [*(one.claim.trial.rows for one in kept), *nuisance])

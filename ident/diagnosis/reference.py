@@ -19,6 +19,7 @@ import numpy as np
 from fri.errors import ConfigurationError
 from ident.diagnosis.evidence import Floats
 from ident.diagnosis.nominal import GAIN_STD
+from ident.diagnosis.usual_sizes import Healthy, UsualSize, scatter_limits
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import PER_LINK
 from ident.effects import EFFECTS, NAMELESS
@@ -68,7 +69,7 @@ class Reference:
     gain_std : of the torque sensors' gains from day to day. compliance_std : (n,) [rad/Nm] standard error of the
     compliance from its scatter over the sets, None for a single one; 0 where no set differs from the first beyond
     chance. shown : mean information of the sets on each candidate, by shape of its grid: the fall of the chi-square for
-    a unit of its coefficients.
+    a unit of its coefficients. usual : size of each candidate on the healthy arm.
     """
 
     model: DynamicModel
@@ -89,6 +90,7 @@ class Reference:
     compliance_std: Floats | None = None
     correlated: Mapping[str, Floats] = field(default_factory=dict)
     shown: Mapping[tuple[str, int], Mapping[str, float]] = field(default_factory=dict)
+    usual: Mapping[tuple[str, int], UsualSize] = field(default_factory=dict)
 
     @property
     def unknown_stiffness(self) -> tuple[str, ...]:
@@ -132,6 +134,7 @@ class Reference:
                 _split(key): {shape: float(v) for shape, v in some.items()}
                 for key, some in stored.get("shown", {}).items()
             }
+            usual = {_split(key): UsualSize.read(one) for key, one in stored.get("usual", {}).items()}
             compliance = np.array(stored["compliance"], dtype=np.float64)
             noise = {side: np.array(v, dtype=np.float64) for side, v in stored["noise"].items()}
             correlated = {side: np.array(v, dtype=float) for side, v in stored.get("correlated", {}).items()}
@@ -170,6 +173,7 @@ class Reference:
             compliance_std,
             correlated,
             shown,
+            usual,
         )
 
     def stored(self) -> dict[str, Any]:
@@ -190,6 +194,7 @@ class Reference:
                     f"{cause} {joint + 1}": {shape: float(f"{v:.4g}") for shape, v in some.items()}
                     for (cause, joint), some in self.shown.items()
                 },
+                "usual": {f"{cause} {joint + 1}": one.stored() for (cause, joint), one in self.usual.items()},
                 "sets": self.sets,
                 "habits": self.habits,
                 "masses": dict(self.masses),
@@ -200,6 +205,14 @@ class Reference:
                 "far_share": _listed(self.far_share),
             }
         }
+
+    def healthy(self) -> Healthy:
+        """Upper 1 % limits of the gain of each candidate in a healthy set, and of its difference from the usual
+        size."""
+        changes = scatter_limits(self.usual, self.sets, _ONE_IN, _AS_SETS)
+        return Healthy(
+            self.limits(), self.shown, {key: (size, changes[key]) for key, size in self.usual.items()}
+        )
 
     def limits(self) -> dict[tuple[str, int], float]:
         """Upper 1 % limit of each candidate's gain in a healthy set, by (cause, joint from 0).

@@ -9,7 +9,7 @@ tolerance, so they neither hide nor mimic a cause.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +19,7 @@ from ident.diagnosis.evidence import Evidence, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.tolerances import HABITUAL, Tolerance, tolerances
+from ident.diagnosis.usual_sizes import Healthy
 from ident.effects import Shape
 from ident.estimators.estimate import normal_tail
 
@@ -50,11 +51,6 @@ _LATEST = 6
 # Least and largest ratio of the information to that of the healthy sets: less of it makes no limit smaller, for what
 # the model lacks differs from motion to motion, too.
 _INFORMATION = (1.0, 25.0)
-
-Null = Mapping[tuple[str, int], float]
-"""Upper limit of each candidate's gain in a healthy set."""
-Shown = Mapping[tuple[str, int], Mapping[str, float]]
-"""Mean information of the healthy sets on each candidate, by shape of its grid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +86,10 @@ def select(
     dictionary: Dictionary,
     evidence: Evidence,
     settings: DiagnosisSettings,
-    null: Null | None = None,
-    shown: Shown | None = None,
+    healthy: Healthy | None = None,
 ) -> Selection:
     """Accept causes one after the other as long as the evidence suffices."""
-    state = State(dictionary, evidence, settings, null or {}, shown or {})
+    state = State(dictionary, evidence, settings, healthy or Healthy())
     state.tolerate([])
     first: dict[tuple[str, int], float] = {}
     accepted: list[Trial] = []
@@ -126,7 +121,7 @@ def gains(
     dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings
 ) -> dict[tuple[str, int], float]:
     """Gain of each candidate before any acceptance, for the null of a healthy arm."""
-    found = State(dictionary, evidence, settings, {}).contenders([])
+    found = State(dictionary, evidence, settings).contenders([])
     return {t.candidate.key: max(t.score.gain, 0.0) for t in found}
 
 
@@ -138,7 +133,7 @@ def best_candidate(
     With noise known from the residual alone, a strong cause counts as noise until it is in the model. Its gain must
     be compared with its own residual.
     """
-    state = State(dictionary, evidence, settings, {})
+    state = State(dictionary, evidence, settings)
     best = next(iter(state.contenders([])), None)
     if best is None or best.score.gain < _LEAST_GAIN:
         return None
@@ -180,8 +175,7 @@ class State:
     dictionary: Dictionary
     evidence: Evidence
     settings: DiagnosisSettings
-    null: Null
-    shown: Shown = field(default_factory=dict)
+    healthy: Healthy = field(default_factory=Healthy)
     nuisance: dict[str, tuple[float, float]] = field(default_factory=dict)
     nuisance_rows: list[Rows] = field(default_factory=list)
     _tolerances: list[Tolerance] | None = None
@@ -252,7 +246,7 @@ class State:
 
     def rivals(self) -> list[Trial]:
         """The simplest candidates by their gain, best first. A gain as on the healthy arm explains nothing."""
-        found = [t for t in self.simplest() if _gain(t) > self.usual(t)]
+        found = [t for t in self.simplest() if self.unusual(t)]
         return sorted(found, key=_gain, reverse=True)
 
     def next(self, accepted: Sequence[Trial], carried: list[Trial]) -> Trial | None:
@@ -284,23 +278,40 @@ class State:
         return False
 
     def usual(self, trial: Trial) -> float:
-        """Upper limit of the gain of such a trial on a healthy arm, in sessions with as much information on it.
+        """Upper limit of the gain of such a trial on a healthy arm, see `_limit`."""
+        return self._limit(
+            trial.candidate, self.healthy.limits.get(trial.candidate.key, 0.0), self.dictionary.nearest(trial)
+        )
+
+    def unusual(self, trial: Trial) -> bool:
+        """Whether a trial is more than on a healthy arm: its gain, or that of its difference from the usual size."""
+        if trial.score.gain > self.usual(trial):
+            return True
+        usual = self.healthy.sizes.get(trial.candidate.key)
+        here = None if usual is None else self.dictionary.scored(trial.candidate, usual[0].shape)
+        if usual is None or here is None:
+            return False
+        size, limit = usual
+        change = size.beyond(here)
+        other = trial.score.gain - max(here.gain, 0.0)
+        return change > 0.0 and change + other > self._limit(trial.candidate, limit, size.shape)
+
+    def _limit(self, candidate: Candidate, limit: float, shape: str) -> float:
+        """The limit of a gain in sessions with as much information on a candidate of a shape.
 
         Few healthy days may be alike by chance, so it is no less than that of the usual change of a scale.
         """
-        key = trial.candidate.key
-        limit, least = self.null.get(key, 0.0), self._scaled(trial.candidate)
-        shape = self.dictionary.nearest(trial)
-        before = self.shown.get(key, {}).get(shape, 0.0)
+        least = self._scaled(candidate)
+        before = self.healthy.shown.get(candidate.key, {}).get(shape, 0.0)
         if not limit or before <= 0.0:
             return max(limit, least)
-        now = self.dictionary.information(trial.candidate).get(shape, 0.0)
+        now = self.dictionary.information(candidate).get(shape, 0.0)
         return max(limit * float(np.clip(now / before, *_INFORMATION)), least)
 
     def _scaled(self, candidate: Candidate) -> float:
         """Gain by the largest usual change from day to day of a cause that is a scale, 0 for others and without a
         reference."""
-        if not candidate.effect.usual_change or not self.null:
+        if not candidate.effect.usual_change or not self.healthy.limits:
             return 0.0
         largest = HABITUAL * max(candidate.effect.usual_change, self.dictionary.nominal.arm.gain_std)
         return self.dictionary.information(candidate).get(repr(Shape()), 0.0) * largest**2
@@ -336,11 +347,15 @@ class State:
         settings = self.settings
         strict = trial.candidate.effect.evidence_factor
         least = strict * (settings.least_gain + 6.0 * (len(score.coefficients) - 1))
-        least = max(least, self.usual(trial)) if healthy else least
-        if trial.candidate.effect.seen_in_samples(trial.shape):
-            return score.gain > least
-        if score.gain <= least or score.p_value >= settings.alpha_rare:
+        if score.gain <= least:
             return False
+        if healthy and not self.unusual(trial):
+            return False
+        if trial.candidate.effect.seen_in_samples(trial.shape):
+            return True
+        if score.p_value >= settings.alpha_rare:
+            return False
+        least = max(least, self.usual(trial)) if healthy else least
         # A brief event is large for a moment, and small in the whole session.
         size = np.inf if trial.candidate.effect.event else score.inflation * self.concentration(trial, score)
         needed = strict * settings.least_inflation

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,8 +13,9 @@ from ident.diagnosis.nominal import NominalArm
 from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Finding, SimulationError
-from ident.diagnosis.selection import Null, Selection, select
+from ident.diagnosis.selection import Selection, select
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.diagnosis.usual_sizes import Healthy
 from ident.model import DynamicModel
 from lwr_driver.session import Session
 
@@ -47,9 +48,14 @@ class Task:
         return sorted([*self.sessions, *self.test], key=lambda s: s.start)
 
     @cached_property
-    def null(self) -> Null | None:
-        """Gain of each candidate in healthy sets."""
-        return None if self.reference is None else self.reference.limits()
+    def healthy(self) -> Healthy | None:
+        """What healthy sets say of the candidates."""
+        return None if self.reference is None else self.reference.healthy()
+
+    @property
+    def limits(self) -> Mapping[tuple[str, int], float] | None:
+        """Upper limit of each candidate's gain in a healthy set."""
+        return None if self.healthy is None else self.healthy.limits
 
     def bench(self, arm: NominalArm, reference: Reference | None, *, fit_compliance: bool) -> DiagnosisBench:
         """Rows, noise and candidates for an arm."""
@@ -59,13 +65,7 @@ class Task:
 
     def select(self, bench: DiagnosisBench) -> Selection:
         """The causes supported by the data of a bench."""
-        return select(
-            bench.dictionary,
-            bench.evidence,
-            self.settings,
-            self.null,
-            None if self.reference is None else self.reference.shown,
-        )
+        return select(bench.dictionary, bench.evidence, self.settings, self.healthy)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from ident.diagnosis.nominal import GAIN_STD, NominalArm
 from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.diagnosis.selection import State
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.diagnosis.usual_sizes import Healthy
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, ModelStructure
@@ -200,7 +201,7 @@ def test_habits_of_healthy_days_are_tolerated_beside_every_cause(chain: Chain) -
         "gear_ripple": Trial(Candidate(EFFECTS["gear_ripple"], 1), Shape(), _score(400.0, 2), {}),
         "cable_spring": Trial(Candidate(EFFECTS["cable_spring"], 2), Shape(), _score(120.0), {}),
     }
-    state = State(None, None, DiagnosisSettings(), {})  # type: ignore[arg-type]
+    state = State(None, None, DiagnosisSettings())  # type: ignore[arg-type]
     state._tolerances = []
     usual = {"stribeck": True, "gear_ripple": True, "cable_spring": False}
     state.carried = lambda trial, score=None, *, healthy=True: (  # type: ignore[method-assign]
@@ -223,9 +224,8 @@ def test_a_limit_grows_with_the_information_of_the_motion_and_falls_with_none() 
         dictionary = SimpleNamespace(
             nearest=lambda trial: "v", information=lambda candidate, now=now: {"v": now}
         )
-        state = State(
-            dictionary, None, DiagnosisSettings(), {("stribeck", 0): 50.0}, {("stribeck", 0): {"v": 10.0}}
-        )  # type: ignore[arg-type]
+        healthy = Healthy({("stribeck", 0): 50.0}, {("stribeck", 0): {"v": 10.0}})
+        state = State(dictionary, None, DiagnosisSettings(), healthy)  # type: ignore[arg-type]
         assert state.usual(trial) == pytest.approx(limit)
 
 

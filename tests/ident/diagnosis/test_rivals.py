@@ -21,7 +21,7 @@ def test_two_causes_in_the_same_rows_do_not_compete(make: Callable[..., Session]
         s["motor"][:, 1] += 0.4 * np.sign(v) * np.exp(-np.abs(v) / 0.15) + 0.6 * np.sin(12.0 * q)
 
     bench = signature_bench([make("a.mcap", 1, rough), make("b.mcap", 2, rough, 1)], chain)
-    state = State(bench.dictionary, bench.evidence, DiagnosisSettings(), {})
+    state = State(bench.dictionary, bench.evidence, DiagnosisSettings())
 
     def trial(cause: str, **shape: float) -> Trial:
         found = bench.dictionary.trial(Candidate(EFFECTS[cause], 1), Shape(**shape))
@@ -43,7 +43,7 @@ def test_best_shapes_are_found_once_beside_the_same_columns_and_anew_beside_othe
 
     def state() -> State:
         causes = bench.dictionary.of(["stribeck", "gear_ripple"])
-        return State(causes, bench.evidence, DiagnosisSettings(), {})
+        return State(causes, bench.evidence, DiagnosisSettings())
 
     one, other = state(), state()
     one.tolerate([])
@@ -70,7 +70,7 @@ def test_what_two_look_alikes_share_counts_for_the_other_one(
         s["motor"][:, 1] += 0.4 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
 
     bench = signature_bench([make("a.mcap", 1, rough), make("b.mcap", 2, rough, 1)], chain)
-    state = State(bench.dictionary, bench.evidence, DiagnosisSettings(), {})
+    state = State(bench.dictionary, bench.evidence, DiagnosisSettings())
     stribeck = Candidate(EFFECTS["stribeck"], 1)
     shapes = [Shape(velocity=speed, exponent=1.0) for speed in (0.15, 0.2)]
 

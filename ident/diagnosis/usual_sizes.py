@@ -1,0 +1,135 @@
+"""The size of each candidate on the healthy arm: its mean over the healthy sets, and how much a set differs from it.
+
+A base model is never quite the arm. What it lacks has the same size on each day, and a gain of its own: no change, and
+no measure of changes. So a candidate is also held against its mean size, by the scatter around it alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from fri.errors import ConfigurationError
+from ident.diagnosis.candidates import Dictionary
+from ident.diagnosis.evidence import Floats, Score
+from ident.estimators.estimate import fisher_limit
+
+# Least square of a size over its variance for a factor between the two.
+_THERE = 9.0
+# Largest change of a size from day to day as a share of it: three standard deviations of friction's.
+_LARGEST_SHARE = 0.3
+
+Key = tuple[str, int]
+"""Cause, and joint from 0."""
+Table = Mapping[Key, Mapping[str, Score]]
+"""Scores of the candidates in a set by the shapes of their grid."""
+
+
+@dataclass(frozen=True, eq=False)
+class UsualSize:
+    """A candidate on the healthy arm.
+
+    shape : of its grid, as text. mean : (k,) coefficients. scatter : gain of a set's difference from the mean size,
+    its unbiased mean square.
+    """
+
+    shape: str
+    mean: Floats
+    scatter: float
+
+    def stored(self) -> dict[str, Any]:
+        """Plain content."""
+        mean = [float(f"{value:.6g}") for value in self.mean]
+        return {"shape": self.shape, "mean": mean, "scatter": round(float(self.scatter), 2)}
+
+    @classmethod
+    def read(cls, content: Mapping[str, Any]) -> UsualSize:
+        """From plain content."""
+        mean = np.array(content["mean"], dtype=np.float64)
+        if mean.ndim != 1 or not len(mean):
+            raise ConfigurationError(f"mean size {content['mean']!r:.40}: give a list of numbers")
+        return cls(str(content["shape"]), mean, float(content["scatter"]))
+
+    def change(self, score: Score) -> float:
+        """Gain of a score's difference from the mean size, in its shape."""
+        return self._gain(score, score.coefficients - self.mean) if self._alike(score) else score.gain
+
+    def beyond(self, score: Score) -> float:
+        """The same beyond the usual changes of a size: 0 for less of it than usual, which is no cause of its own."""
+        if not self._alike(score):
+            return score.gain
+        away = score.coefficients - self.mean
+        if float(score.coefficients @ np.linalg.pinv(score.covariance) @ away) <= 0.0:
+            return 0.0
+        change, usual = self._gain(score, away), (_LARGEST_SHARE**2) * self._gain(score, self.mean)
+        return change if change > usual else 0.0
+
+    def _alike(self, score: Score) -> bool:
+        return score.coefficients.shape == self.mean.shape
+
+    def _gain(self, score: Score, size: Floats) -> float:
+        """Gain of coefficients (k,) in the shape of a score."""
+        inverse, own = np.linalg.pinv(score.covariance), score.coefficients
+        square = float(own @ inverse @ own)
+        # The covariance from blocks and cross-validation differ by a factor, unknown for what is hardly there.
+        factor = max(score.gain, 0.0) / square if square > _THERE else 1.0
+        return factor * float(size @ inverse @ size)
+
+
+@dataclass(frozen=True, eq=False)
+class Healthy:
+    """What healthy sets say of the candidates. limits : upper limit of the gain in a healthy set. shown : mean
+    information, by shape of the grid. sizes : usual size, and the upper limit of the gain of a difference from it."""
+
+    limits: Mapping[Key, float] = field(default_factory=dict)
+    shown: Mapping[Key, Mapping[str, float]] = field(default_factory=dict)
+    sizes: Mapping[Key, tuple[UsualSize, float]] = field(default_factory=dict)
+
+
+def scores(dictionary: Dictionary) -> Table:
+    """Scores of all candidates with a size of their own, beside the present columns of the evidence."""
+    return {candidate.key: dictionary.scores(candidate) for candidate in dictionary.candidates}
+
+
+def usual_sizes(sets: Sequence[Table]) -> dict[Key, UsualSize]:
+    """The usual size of each candidate in several sets, empty for one set: in the shape of most gain, with the rest of
+    each set's gain, of another shape, as a difference."""
+    found: dict[Key, UsualSize] = {}
+    for key in sets[0] if len(sets) > 1 else ():
+        tables = [table.get(key, {}) for table in sets]
+        shapes = [shape for shape in tables[0] if all(shape in table for table in tables)]
+        if not shapes:
+            continue
+        best = max(shapes, key=lambda shape: sum(max(table[shape].gain, 0.0) for table in tables))
+        mean = np.mean([table[best].coefficients for table in tables], axis=0)
+        size = UsualSize(best, mean, 0.0)
+        total = 0.0
+        for table in tables:
+            here = table[best]
+            largest = max(max(score.gain, 0.0) for score in table.values())
+            total += max(largest - max(here.gain, 0.0) + size.change(here), 0.0)
+        found[key] = UsualSize(best, mean, total / (len(sets) - 1))
+    return found
+
+
+def scatter_limits(
+    sizes: Mapping[Key, UsualSize], sets: int, one_in: float, as_changes: float
+) -> dict[Key, float]:
+    """Upper limit of the gain of a further set's difference from the mean size, exceeded by one healthy set in
+    1 / `one_in`; the mean of a cause over the joints counts as further changes."""
+    if not sizes:
+        return {}
+    by_cause: dict[str, list[float]] = {}
+    for (cause, _), size in sizes.items():
+        by_cause.setdefault(cause, []).append(size.scatter)
+    noise = float(np.median([size.scatter for size in sizes.values()]))
+    changes = sets - 1 + as_changes
+    factor = fisher_limit(one_in, 1, changes) * (1.0 - sets**-2.0)
+    found = {}
+    for key, size in sizes.items():
+        mean = ((sets - 1) * size.scatter + as_changes * float(np.mean(by_cause[key[0]]))) / changes
+        found[key] = noise + factor * max(mean - noise, 0.0)
+    return found

@@ -1,0 +1,104 @@
+"""What the base model lacks on every day is no measure of changes: candidates against their usual size."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fri.errors import ConfigurationError
+from ident.diagnosis.candidates import Candidate, Trial
+from ident.diagnosis.evidence import Score
+from ident.diagnosis.selection import State
+from ident.diagnosis.settings import DiagnosisSettings
+from ident.diagnosis.usual_sizes import Healthy, UsualSize, scatter_limits, usual_sizes
+from ident.effects import EFFECTS, Shape
+
+KEY = ("stribeck", 0)
+
+
+def score(*values: float, information: float = 100.0) -> Score:
+    """Coefficients of a given information each, all of it gain."""
+    c = np.array(values)
+    gain = information * float(c @ c)
+    return Score(gain, gain, c, 0.02, lambda: (np.eye(len(c)) / information, 40))
+
+
+def test_what_two_days_have_in_common_is_the_usual_size_and_only_their_difference_scatter() -> None:
+    alike = usual_sizes([{KEY: {"v": score(1.0)}}, {KEY: {"v": score(1.1)}}])[KEY]
+    assert alike.mean == pytest.approx([1.05])
+    assert alike.scatter == pytest.approx(100.0 * 2 * 0.05**2)
+    opposite = usual_sizes([{KEY: {"v": score(1.0)}}, {KEY: {"v": score(-1.0)}}])[KEY]
+    assert opposite.mean == pytest.approx([0.0])
+    assert opposite.scatter == pytest.approx(200.0)
+
+
+def test_the_gain_of_another_shape_counts_as_scatter() -> None:
+    tables = [{KEY: {"v": score(1.0), "w": score(1.5)}}, {KEY: {"v": score(1.0), "w": score(0.0)}}]
+    found = usual_sizes(tables)[KEY]
+    assert found.shape == "w"
+    # By the shape of most gain: 0.75 from the mean each, and the second set's gain by a shape of its own.
+    assert found.scatter == pytest.approx(2 * 100.0 * 0.75**2 + 100.0)
+    assert not usual_sizes([{KEY: {"v": score(1.0)}}, {KEY: {"w": score(1.0)}}])
+
+
+def test_one_day_says_nothing_of_a_usual_size() -> None:
+    assert not usual_sizes([{KEY: {"v": score(1.0)}}])
+    assert not scatter_limits({}, 1, 0.01, 4)
+
+
+def test_a_change_is_measured_from_the_usual_size_in_both_directions() -> None:
+    size = UsualSize("v", np.array([1.0, 0.0]), 3.0)
+    assert size.change(score(1.0, 0.0)) == pytest.approx(0.0)
+    assert size.change(score(2.0, 0.0)) == pytest.approx(100.0)
+    assert size.change(score(-1.0, 0.0)) == pytest.approx(400.0)
+    # Another number of coefficients is another law.
+    assert size.change(score(1.0)) == pytest.approx(100.0)
+
+
+def test_a_size_as_on_other_days_and_less_of_it_is_no_change() -> None:
+    size = UsualSize("v", np.array([1.0]), 3.0)
+    assert size.beyond(score(1.25)) == 0.0
+    assert size.beyond(score(1.5)) == pytest.approx(100.0 * 0.25)
+    assert size.beyond(score(0.2)) == 0.0
+    assert size.beyond(score(-0.5)) == pytest.approx(100.0 * 2.25)
+
+
+def test_a_constant_misfit_hides_no_change_of_the_same_candidate() -> None:
+    """A gain below that of the healthy days is a finding where the days agreed, and none where they did not."""
+    trial = Trial(Candidate(EFFECTS["stribeck"], 0), Shape(velocity=0.05), score(2.0), {})
+    dictionary = SimpleNamespace(
+        nearest=lambda trial: "v",
+        information=lambda candidate: {"v": 100.0},
+        scored=lambda candidate, shape: trial.score if shape == "v" else None,
+    )
+
+    def state(mean: float, limit: float) -> State:
+        sizes = {KEY: (UsualSize("v", np.array([mean]), 1.0), limit)}
+        healthy = Healthy({KEY: 1000.0}, {KEY: {"v": 100.0}}, sizes)
+        return State(dictionary, None, DiagnosisSettings(), healthy)  # type: ignore[arg-type]
+
+    assert state(1.0, 50.0).unusual(trial)
+    assert not state(1.0, 150.0).unusual(trial)
+    assert not state(2.0, 50.0).unusual(trial)
+    assert not State(dictionary, None, DiagnosisSettings(), Healthy({KEY: 1000.0})).unusual(trial)  # type: ignore[arg-type]
+
+
+def test_limits_of_scatter_lean_on_the_other_joints() -> None:
+    sizes = {
+        ("stribeck", j): UsualSize("v", np.ones(1), scatter) for j, scatter in enumerate((40.0, 1.0, 1.0))
+    }
+    limits = scatter_limits(sizes, 2, 0.01, 4)
+    assert limits["stribeck", 0] > limits["stribeck", 1] > 1.0
+    many = scatter_limits(sizes, 12, 0.01, 4)
+    assert many["stribeck", 1] < limits["stribeck", 1]
+
+
+def test_a_usual_size_is_read_as_it_was_written() -> None:
+    size = UsualSize("Shape(velocity=0.05)", np.array([1.25, -3e-7]), 12.34)
+    again = UsualSize.read(size.stored())
+    assert (again.shape, again.scatter) == (size.shape, size.scatter)
+    assert again.mean == pytest.approx(size.mean)
+    with pytest.raises(ConfigurationError, match="give a list of numbers"):
+        UsualSize.read({"shape": "v", "mean": [], "scatter": 1.0})
