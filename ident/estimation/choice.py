@@ -48,6 +48,7 @@ from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior
 from ident.estimators.prior import Disagreement, MaximumAPosteriori, Prior
 from ident.estimators.problem import Problem
+from ident.rows.content import Recall
 from ident.rows.filters import half_width
 from ident.rows.sessions import require
 from lwr_driver.listing import Listing, Piece, text_of
@@ -208,7 +209,7 @@ def choose(
     require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
     rows = observed(sessions, chain, plain, known=known)
     first = rows.identified(rows.settings)
-    choice = compared(first, sessions, tilt=tilt)
+    choice = compared(first, sessions, tilt=tilt, recall=rows.recall)
     winner = choice.winner
     options: dict[str, Any] = {"prior_strength": winner.prior_scale} if winner.estimator == "physical" else {}
     settled = replace(first.settings, estimator=settings.estimator, essential=settings.essential)
@@ -239,15 +240,21 @@ def _calibrated(session: Session, gains: Mapping[str, tuple[float, float]]) -> S
 
 
 def compared(
-    found: Identification, sessions: Sessions, *, tilt: bool | None = None, used: str = ""
+    found: Identification,
+    sessions: Sessions,
+    *,
+    tilt: bool | None = None,
+    used: str = "",
+    recall: Recall | None = None,
 ) -> Choice:
     """The candidates' errors on held-back parts of the sessions of an identification, and the best of them.
 
-    tilt : as for `choose`. used : the estimator of the identification, if it stays whatever is found.
+    tilt : as for `choose`. used : the estimator of the identification, if it stays whatever is found. recall : see
+    `prepare`.
     """
     chain, model = found.structure.chain, found.settings.model
     leaning = model != 3 and bool(np.any(chain.gravity)) and tilt is not False
-    lean = tilt_columns(found, as_sessions(sessions)) if leaning else None
+    lean = tilt_columns(found, as_sessions(sessions), recall) if leaning else None
     bodies = cad_prior(found.base) if chain.urdf is not None and model != 3 else None
     tilted = (False,) if not leaning else (False, True) if tilt is None else (True,)
     return replace(_Comparison.of(found, lean, bodies).choice(tilted), used=used)

@@ -28,13 +28,13 @@ from ident.estimators.physical import cad_prior
 from ident.estimators.problem import Problem
 from ident.model.dynamic_model import DynamicModel
 from ident.model.signals import signals_entry
+from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import stack
 from ident.rows.prepare import PreparedSession
 from ident.rows.sessions import payload_name, require
 from ident.rows.shared_rows import marks
 from ident.rows.signal_choice import choose_signals
-from ident.rows.timebase import KnownOutliers
 from ident.screening.screen import require_sound
 from lwr_driver.listing import Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
@@ -282,7 +282,8 @@ class Observed:
     """The rows of the sessions of an arm, for any number of estimators.
 
     settings : with the figures that the data chose. problem : the stacked regression. instruments : the rows of the
-    commanded motion, empty where a session has none. sessions : with the chain's joints. Others: see `Identification`.
+    commanded motion, empty where a session has none. sessions : with the chain's joints. recall : of them, see
+    `prepare`. Others: see `Identification`.
     """
 
     settings: IdentificationSettings
@@ -294,6 +295,7 @@ class Observed:
     payloads: tuple[str | None, ...]
     sessions: tuple[Session, ...]
     known: Known
+    recall: Recall
 
     @cached_property
     def marks(self) -> tuple[str, ...]:
@@ -423,18 +425,16 @@ def observed(
         settings.coulomb or Coulomb(),
         () if sensed else ("motor",),
     )
-    first, outliers = known is None, KnownOutliers()
+    first, recall = known is None, Recall()
     if known is None:
         found = require_sound(
-            chosen, chain, settings.signals, settings.couplings, motor=needs_motor, outliers=outliers
+            chosen, chain, settings.signals, settings.couplings, motor=needs_motor, recall=recall
         )
         known = Known(tuple(found))
     mounted = payloads if settings.model != 3 else [None] * len(payloads)
     base = numeric_base(structure, _conditions(structure, chosen, mounted))
     laws = (settings.coulomb, settings.row_coulomb)
-    signals = choose_signals(
-        chosen, mounted, structure, base.columns, settings.signals, laws, outliers=outliers
-    )
+    signals = choose_signals(chosen, mounted, structure, base.columns, settings.signals, laws, recall=recall)
     known = replace(known, signal_reasons=known.signal_reasons or signals.reasons)
     rows_structure = replace(structure, coulomb=signals.row_coulomb)
     structure = replace(structure, coulomb=signals.coulomb)
@@ -450,7 +450,7 @@ def observed(
         resonance_hz=settings.resonance_hz,
         motor=needs_motor,
         advise=not known.signal_reasons,
-        outliers=outliers,
+        recall=recall,
     )
     # One session after the other, so that memory holds the full-rate signals of one only.
     made = [make(session, payload, log=first) for session, payload in zip(chosen, mounted, strict=True)]
@@ -468,6 +468,7 @@ def observed(
         payloads=tuple(payloads),
         sessions=tuple(chosen),
         known=known,
+        recall=recall,
     )
 
 

@@ -31,6 +31,7 @@ from ident.estimators.estimate import Covariance, fisher_tail
 from ident.estimators.physical import cad_prior
 from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.estimators.problem import Problem
+from ident.rows.content import Recall
 from ident.rows.observation import observe
 from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
 from ident.rows.sessions import require
@@ -195,10 +196,12 @@ def _step(
     return estimate.values[-2:], stated
 
 
-def tilt_columns(found: Identification, sessions: Sequence[Session]) -> list[Floats]:
-    """d(torque) / d(tilt) (m, 2) [Nm/rad] of each row group, with the estimated parameters."""
+def tilt_columns(
+    found: Identification, sessions: Sequence[Session], recall: Recall | None = None
+) -> list[Floats]:
+    """d(torque) / d(tilt) (m, 2) [Nm/rad] of each row group, with the estimated parameters. recall : see `prepare`."""
     gravity = found.structure.chain.gravity
-    return _columns(found, sessions, list(sideways_gravity(gravity, _axes(gravity))))
+    return _columns(found, sessions, list(sideways_gravity(gravity, _axes(gravity))), recall)
 
 
 def with_tilt(problem: Problem, columns: Sequence[Floats]) -> Problem:
@@ -215,7 +218,10 @@ def with_tilt(problem: Problem, columns: Sequence[Floats]) -> Problem:
 
 
 def _columns(
-    found: Identification, sessions: Sequence[Session], directions: Sequence[Floats]
+    found: Identification,
+    sessions: Sequence[Session],
+    directions: Sequence[Floats],
+    recall: Recall | None = None,
 ) -> list[Floats]:
     """Torque (m, 2) of each row group at rest under each gravity, the change of torque for one of gravity."""
     structure, settings = found.structure, found.settings
@@ -232,6 +238,7 @@ def _columns(
             motor=settings.model == 2,
             log=False,
             blocks=True,
+            recall=recall,
         )
         still = _at_rest(moving)
         result += [group.matrix for group in observe([still], [payload], leaning).groups]

@@ -10,11 +10,11 @@ from fri.errors import DataError
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.structure import ModelStructure
 from ident.estimators.problem import Problem
+from ident.rows.content import Recall
 from ident.rows.delay import SHIFT_S, Delay, delay_alone
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import PreparedSession, prepare
-from ident.rows.timebase import Outliers
 from ident.screening.screen import without_dead
 from lwr_driver.session import Session
 
@@ -64,7 +64,7 @@ def session_rows(
     motor: bool,
     log: bool,
     advise: bool,
-    outliers: Outliers,
+    recall: Recall,
     delay_s: float | None = None,
     instruments: bool = True,
 ) -> SessionRows:
@@ -82,7 +82,7 @@ def session_rows(
         log=log,
         advise=advise,
         blocks=True,
-        outliers=outliers,
+        recall=recall,
     )
     seen = observe([whole], [payload], structure, columns=base.columns, names=base.names, units=base.units)
     problem = without_dead(seen, session)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import PurePath
 from typing import Any, Generic, TypeVar
 
@@ -36,6 +37,26 @@ class Kept(Generic[Result]):
         while len(self._found) > self._most:
             self._found.pop(next(iter(self._found)))
         return found
+
+
+class Recall:
+    """Results of the steps of one command on the same sessions.
+
+    Arrays and columns count by identity and must not change, plain values by value. It keeps them.
+    """
+
+    def __init__(self) -> None:
+        self._found: dict[Any, dict[tuple[Any, ...], tuple[tuple[Any, ...], Any]]] = {}
+
+    def of(self, make: partial[Result], *things: Any, most: int = 64) -> Result:
+        """make(), or what its function gave for the same things; of the latest `most` results of the function."""
+        results = self._found.setdefault(make.func, {})
+        key = tuple(thing if isinstance(thing, _PLAIN) else id(thing) for thing in things)
+        found: tuple[tuple[Any, ...], Result] = results.pop(key) if key in results else (things, make())
+        results[key] = found
+        while len(results) > most:
+            results.pop(next(iter(results)))
+        return found[1]
 
 
 def content(*things: Any) -> bytes:

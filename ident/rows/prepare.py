@@ -8,8 +8,9 @@ the motor channel minus its delay, so a slow or irregular torque is never resamp
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import DriveMotion
-from ident.rows.data_quality import frozen_flags, frozen_positions, frozen_torques, held, stale
+from ident.rows.content import Recall
+from ident.rows.data_quality import Frozen, frozen_flags, frozen_positions, frozen_torques, held, stale
 from ident.rows.delay import DELAY_DB, DELAY_HZ, Delay, DelayData, estimate_delay
 from ident.rows.filters import (
     Excitation,
@@ -38,16 +40,15 @@ from ident.rows.filters import (
     thinning,
 )
 from ident.rows.reversals import away_from_reversals, turning_reach
-from ident.rows.sample_clock import sample_clock
+from ident.rows.sample_clock import SampleClock, sample_clock
 from ident.rows.timebase import (
-    Outliers,
     Stretch,
     flag_outliers,
     sample_period,
     stretches,
 )
 from lwr_driver.session import JointColumns, Session
-from lwr_driver.session.spool import release, shelved, spans
+from lwr_driver.session.spool import LEAST_BYTES, release, shelved, spans
 
 BoolArray = NDArray[np.bool_]
 
@@ -58,6 +59,8 @@ logger = logging.getLogger(__name__)
 _DISAGREEMENT = 3.0
 # Longest block [s]. Bounds of the frequency and the attenuation of the rows of a delay.
 _BLOCK_S = 120.0
+# Latest filtered motions of stretches: two sessions at two cut-offs.
+_MOST_MOTIONS = 4
 _SAMPLED = ("times", "q", "qd", "qdd", "torque", "flagged", "known")
 
 
@@ -185,18 +188,18 @@ def prepare(
     log: bool = True,
     advise: bool = True,
     blocks: bool = False,
-    outliers: Outliers = flag_outliers,
+    recall: Recall | None = None,
 ) -> PreparedSession:
     """Filter and align one session.
 
     motor : False leaves the motor channel aside. log : False keeps warnings to itself. advise : False gives no advice
     on cut-offs, for those that the data chose. blocks : passages of two minutes at most, with samples beyond their
-    ends for the filters and kept in files, so that the memory does not grow with the session. outliers : finds them;
-    for one that remembers them from one call to the next.
+    ends for the filters and kept in files, so that the memory does not grow with the session. recall : what earlier
+    calls with the same session found.
 
     Raises DataError for too few samples, times that do not increase, non-finite values, no torque, no motion.
     """
-    name = session.path.name
+    name, recall = session.path.name, recall or Recall()
     _check_finite(session.joint, name)
     origin = int(clock_ns(session.joint)[0])
     stamps = np.asarray((clock_ns(session.joint) - origin) * 1e-9, dtype=np.float64)
@@ -215,22 +218,20 @@ def prepare(
     dt = sample_period(times, sequence, f"{name}: /joint_states")
     settings = (settings or SignalSettings()).settled(1.0 / dt)
     warnings: list[str] = []
-    position_flags, crowded = outliers(position, settings.outlier_scale)
-    effort_flags, also = outliers(effort, settings.outlier_scale)
-    kept = held(effort, times, times, position) if sensed else np.zeros(len(times), dtype=bool)
-    stuck = frozen_flags(frozen_torques(effort, times, times, position) if sensed else (), effort.shape)
+    position_flags, crowded = _outliers(position, settings, recall)
+    effort_flags, also = _outliers(effort, settings, recall)
+    seen = recall.of(partial(_seen, session.joint, times, clock), session.joint)
+    kept, stuck = seen.held, frozen_flags(seen.torques, effort.shape)
     effort_flags = effort_flags | kept[:, None] | stuck
     warnings += _jumping(name, "position", session.joint_names, crowded)
     warnings += _jumping(name, "joint torque", session.joint_names, also)
-    names = moving(position, session.joint_names)
-    if not names:
+    if not seen.moving:
         raise DataError(
             f"{name}: no joint moves by more than 0.01 rad; record an excitation motion, a pose alone does "
             "not show inertia and friction"
         )
-    old = stale(session.joint) if clock is None else clock.repeated
-    unseen = frozen_flags(frozen_positions(session.joint), position.shape).any(axis=1)
-    bad: BoolArray = np.asarray(position_flags.any(axis=1)) | old | unseen
+    unseen = frozen_flags(seen.positions, position.shape).any(axis=1)
+    bad: BoolArray = np.asarray(position_flags.any(axis=1)) | seen.stale | unseen
     parts, lost = stretches(times, (position, effort), bad, dt, settings.longest_bridge_s)
     if not parts:
         raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
@@ -238,13 +239,14 @@ def prepare(
     grid, period_rows = _row_grid(windows, periods, settings)
     count, resampled = len(parts), any(part.resampled for part in parts)
     springs = _stiffness(settings, session.joint_names) if sensed else None
-    longest = max(parts, key=lambda part: part.count)
-    spectrum = Excitation(longest.count, dt)
-    motions = _shelved(_filtered(parts, longest, spectrum, effort_flags, times, settings, springs, blocks))
+    same = session.joint, settings.cutoff, settings.order, settings.outlier_scale, settings.longest_bridge_s
+    wide = partial(_wide, effort_flags, times, settings, springs, recall, same)
+    motions = _shelved(_filtered(parts, wide, settings, blocks))
     release(position, effort)
-    excitation = spectrum.frequency()
+    longest = max(parts, key=lambda part: part.count)
+    excitation = recall.of(partial(_excitation_hz, motions, longest, dt), *same)
     flagged = {
-        "stale": int(old.sum()),
+        "stale": int(seen.stale.sum()),
         "position_outliers": int(position_flags.sum()),
         "joint_torque_outliers": int((effort_flags & ~stuck)[~kept].sum()),
         "joint_torque_held": int(kept.sum()),
@@ -252,9 +254,9 @@ def prepare(
         "position_frozen": int(unseen.sum()),
     }
     # A tenth of a gigabyte for an hour.
-    del parts, longest, position_flags, effort_flags, old, kept, stuck, unseen, bad, times
+    del parts, longest, position_flags, effort_flags, kept, stuck, unseen, bad, times
     motor_data = (
-        _motor(session, origin, settings, name, warnings, outliers)
+        _motor(session, origin, settings, name, warnings, recall)
         if motor and session.motor is not None
         else None
     )
@@ -317,12 +319,44 @@ def prepare(
         delay=delay,
         excitation_hz=excitation,
         cutoff_hz=settings.cutoff,
-        moving=names,
+        moving=seen.moving,
         counts=counts,
         warnings=tuple(warnings),
         uid=session.metadata.get("uid", ""),
         mean_torque=_mean_torque(passages) if sensed else (),
         jitter_s=None if clock is None else clock.jitter_s,
+    )
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the joint channel shows of its samples, whatever the settings.
+
+    stale : (N,), older than their stamps or repeated. held : (N,), with torques kept in all joints. positions,
+    torques : frozen ones. moving : names of the moving joints.
+    """
+
+    stale: BoolArray
+    held: BoolArray
+    positions: tuple[Frozen, ...]
+    torques: tuple[Frozen, ...]
+    moving: tuple[str, ...]
+
+
+def _outliers(values: Floats, settings: SignalSettings, recall: Recall) -> tuple[BoolArray, list[int]]:
+    """Flags (n, k) and columns with too many of them: see `flag_outliers`."""
+    scale = settings.outlier_scale
+    return recall.of(partial(flag_outliers, values, scale), values, scale)
+
+
+def _seen(joint: JointColumns, times: Floats, clock: SampleClock | None) -> _Seen:
+    position, effort, sensed = joint.position, joint.effort, bool(joint.effort.shape[1])
+    return _Seen(
+        stale(joint) if clock is None else clock.repeated,
+        held(effort, times, times, position) if sensed else np.zeros(len(times), dtype=bool),
+        frozen_positions(joint),
+        frozen_torques(effort, times, times, position) if sensed else (),
+        moving(position, joint.names),
     )
 
 
@@ -335,6 +369,73 @@ def _mean_torque(passages: list[Passage]) -> tuple[float, ...]:
         count += int(inside.sum())
         passage.release()
     return tuple((sums / max(count, 1)).tolist())
+
+
+@dataclass(frozen=True)
+class _Wide:
+    """Filtered motion of the samples of a stretch from number `low` on, and their joint torque.
+
+    q, qd, qdd, torque, flagged : (n, J). drive : as in `TorqueChannel`.
+    """
+
+    low: int
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    torque: Floats
+    flagged: BoolArray
+    drive: DriveMotion | None
+
+    @classmethod
+    def of(
+        cls,
+        part: Stretch,
+        low: int,
+        high: int,
+        effort_flags: BoolArray,
+        times: Floats,
+        settings: SignalSettings,
+        stiffness: Floats | None,
+    ) -> _Wide:
+        """The samples from `low` to before `high`."""
+        joints = effort_flags.shape[1]
+        values = part.part(low, high)
+        release(*part.columns)
+        q = low_pass(values[:, :joints], part.dt, settings.cutoff, settings.order)
+        qd, qdd = differentiate(q, part.dt)
+        torque = values[:, joints:].copy()
+        flagged = np.repeat(part.bridged[low:high, None], joints, axis=1)
+        grid = part.start + part.dt * np.arange(low, high, dtype=np.float64)
+        for joint in np.flatnonzero(effort_flags.any(axis=0)):
+            hit = np.rint((times[effort_flags[:, joint]] - part.start) / part.dt).astype(np.int64) - low
+            spread = np.unique(np.concatenate([hit - 1, hit, hit + 1])) if part.resampled else np.unique(hit)
+            flagged[spread[(spread >= 0) & (spread < len(grid))], joint] = True
+            good = ~flagged[:, joint]
+            torque[~good, joint] = np.interp(grid[~good], grid[good], torque[good, joint])
+        drive = None
+        if stiffness is not None:
+            twist = low_pass(torque / stiffness, part.dt, settings.cutoff, settings.order)
+            rate, change = differentiate(twist, part.dt)
+            drive = DriveMotion(qd + rate, qdd + change)
+        return cls(low, q, qd, qdd, torque, flagged, drive)
+
+
+def _wide(
+    effort_flags: BoolArray,
+    times: Floats,
+    settings: SignalSettings,
+    stiffness: Floats | None,
+    recall: Recall,
+    same: tuple[Any, ...],
+    part: Stretch,
+    low: int,
+    high: int,
+) -> _Wide:
+    """`_Wide.of`, recalled for a short stretch. same : what the motion of a session depends on."""
+    make = partial(_Wide.of, part, low, high, effort_flags, times, settings, stiffness)
+    if high - low < part.count or 8 * effort_flags.shape[1] * part.count >= LEAST_BYTES:
+        return make()
+    return recall.of(make, *same, settings.stiffness_nm_rad, part.start, most=_MOST_MOTIONS)
 
 
 @dataclass(frozen=True)
@@ -364,40 +465,19 @@ class _Motion:
         part: Stretch,
         span: tuple[int, int],
         core: tuple[float, float],
-        effort_flags: BoolArray,
-        times: Floats,
+        wide: _Wide,
         settings: SignalSettings,
-        stiffness: Floats | None,
     ) -> _Motion:
-        """The samples from span[0] to before span[1], filtered with those around."""
-        joints = effort_flags.shape[1]
+        """The samples from span[0] to before span[1] of `wide`."""
         beside = settings.reversal, settings.standstill_rad_s, settings.turning
-        seen = turning_reach(*beside)
-        around = int(np.ceil((settling(settings.cutoff, settings.order) + seen) / part.dt)) + 16
-        low, high = max(span[0] - around, 0), min(span[1] + around, part.count)
-        values = part.part(low, high)
-        release(*part.columns)
-        q = low_pass(values[:, :joints], part.dt, settings.cutoff, settings.order)
-        qd, qdd = differentiate(q, part.dt)
-        torque = values[:, joints:].copy()
-        flagged = np.repeat(part.bridged[low:high, None], joints, axis=1)
-        grid = part.start + part.dt * np.arange(low, high, dtype=np.float64)
-        for joint in np.flatnonzero(effort_flags.any(axis=0)):
-            hit = np.rint((times[effort_flags[:, joint]] - part.start) / part.dt).astype(np.int64) - low
-            spread = np.unique(np.concatenate([hit - 1, hit, hit + 1])) if part.resampled else np.unique(hit)
-            flagged[spread[(spread >= 0) & (spread < len(grid))], joint] = True
-            good = ~flagged[:, joint]
-            torque[~good, joint] = np.interp(grid[~good], grid[good], torque[good, joint])
-        away = away_from_reversals(qd, part.dt, *beside)
-        away &= np.abs(qd) > settings.slow
-        drive = None
-        kept = slice(span[0] - low, span[1] - low)
-        if stiffness is not None:
-            twist = low_pass(torque / stiffness, part.dt, settings.cutoff, settings.order)
-            rate, change = differentiate(twist, part.dt)
-            drive = DriveMotion((qd + rate)[kept], (qdd + change)[kept])
-        states = q[kept], qd[kept], qdd[kept], torque[kept]
-        return cls(part.start, part.end, part.dt, span[0], core, *states, flagged[kept], away[kept], drive)
+        away = away_from_reversals(wide.qd, part.dt, *beside)
+        away &= np.abs(wide.qd) > settings.slow
+        kept = slice(span[0] - wide.low, span[1] - wide.low)
+        states = wide.q[kept], wide.qd[kept], wide.qdd[kept], wide.torque[kept]
+        drive = None if wide.drive is None else wide.drive.at(kept)
+        return cls(
+            part.start, part.end, part.dt, span[0], core, *states, wide.flagged[kept], away[kept], drive
+        )
 
     @property
     def arrays(self) -> tuple[Floats | BoolArray, ...]:
@@ -481,22 +561,28 @@ class _Motion:
 
 def _filtered(
     parts: list[Stretch],
-    longest: Stretch,
-    spectrum: Excitation,
-    effort_flags: BoolArray,
-    times: Floats,
+    wide: Callable[[Stretch, int, int], _Wide],
     settings: SignalSettings,
-    stiffness: Floats | None,
     blocks: bool,
 ) -> Iterator[_Motion]:
-    """The motions of all stretches, block after block; the longest one goes into the spectrum."""
+    """The motions of all stretches, block after block. wide : the samples of a stretch between two numbers."""
+    seen = turning_reach(settings.reversal, settings.standstill_rad_s, settings.turning)
     for part in parts:
+        around = int(np.ceil((settling(settings.cutoff, settings.order) + seen) / part.dt)) + 16
         for span, core in _cut(part, settings, blocks):
-            motion = _Motion.of(part, span, core, effort_flags, times, settings, stiffness)
-            if part is longest:
-                mine = (motion.times >= core[0]) & (motion.times < core[1])
-                spectrum.add(motion.qd[mine])
-            yield motion
+            low, high = max(span[0] - around, 0), min(span[1] + around, part.count)
+            yield _Motion.of(part, span, core, wide(part, low, high), settings)
+
+
+def _excitation_hz(motions: Sequence[_Motion], part: Stretch, dt: float) -> float:
+    """Upper frequency of the motion of a stretch [Hz]."""
+    spectrum = Excitation(part.count, dt)
+    for motion in motions:
+        if motion.start == part.start:
+            mine = (motion.times >= motion.core[0]) & (motion.times < motion.core[1])
+            spectrum.add(motion.qd[mine])
+            release(*motion.arrays)
+    return spectrum.frequency()
 
 
 def _cut(
@@ -619,7 +705,7 @@ def _motor(
     settings: SignalSettings,
     name: str,
     warnings: list[str],
-    outliers: Outliers,
+    recall: Recall,
 ) -> tuple[Floats, Floats, BoolArray]:
     """Times (m,) [s] on the joint channel's clock, torques (m, J) and outlier flags (m, J) of the motor channel."""
     assert session.motor is not None
@@ -639,7 +725,7 @@ def _motor(
         )
     sample_period(times, None, f"{name}: /motor_states")
     effort = session.motor.effort
-    flags, crowded = outliers(effort, settings.outlier_scale)
+    flags, crowded = _outliers(effort, settings, recall)
     warnings += _jumping(name, "motor torque", session.joint_names, crowded)
     path_times = np.asarray((reference - origin) * 1e-9, dtype=np.float64)
     path = session.joint.position

@@ -47,12 +47,11 @@ from ident.rows.class_rows import (
     fit,
     nested,
 )
-from ident.rows.content import Kept
+from ident.rows.content import Kept, Recall
 from ident.rows.data_quality import passed_band
 from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass
 from ident.rows.prepare import prepare
 from ident.rows.reversals import TURNING_RAD
-from ident.rows.timebase import KnownOutliers, Outliers
 from lwr_driver.session import Session
 
 logger = logging.getLogger(__name__)
@@ -97,12 +96,12 @@ def choose_signals(
     settings: SignalSettings,
     laws: tuple[Coulomb | None, Coulomb | None] = (None, None),
     *,
-    outliers: Outliers | None = None,
+    recall: Recall | None = None,
 ) -> SignalChoice:
     """The figures that `settings` leaves open, and the friction laws, for the sessions of one model.
 
     laws : of the model, None to choose, and of the rows, None for that of the model.
-    payloads : mounted in each session. columns : base columns of the structure. outliers : as for `prepare`.
+    payloads : mounted in each session. columns : base columns of the structure. recall : as for `prepare`.
     """
     coulomb, row_coulomb = laws
     given = None not in (
@@ -116,7 +115,7 @@ def choose_signals(
         return SignalChoice(settings, coulomb, row_coulomb or coulomb)
     parts = [_excerpt(session, _MOST_S / len(sessions)) for session in sessions]
     made = _choices.of(
-        partial(_chosen, outliers=outliers or KnownOutliers()),
+        partial(_chosen, recall=recall or Recall()),
         parts, tuple(payloads), structure, columns, settings, laws,
     )  # fmt: skip
     for reason in made.reasons:
@@ -135,18 +134,18 @@ def _chosen(
     settings: SignalSettings,
     laws: tuple[Coulomb | None, Coulomb | None],
     *,
-    outliers: Outliers,
+    recall: Recall,
 ) -> SignalChoice:
     """The choice for the parts of the sessions in use."""
     coulomb, row_coulomb = laws
     motor = structure.sides != ("joint",)
     rate = min(1.0 / session.joint.period_s for session in parts)
     reasons: list[str] = []
-    found, band = _with_decimation(settings, parts, rate, motor, reasons, outliers)
-    rough = [prepare(session, found, motor=motor, log=False, outliers=outliers) for session in parts]
+    found, band = _with_decimation(settings, parts, rate, motor, reasons, recall)
+    rough = [prepare(session, found, motor=motor, log=False, recall=recall) for session in parts]
     delays = [0.0 if one.delay is None else one.delay.seconds for one in rough]
     block_s = min(_BLOCK_S, min(session.duration_s for session in parts) / _LEAST_BLOCKS)
-    bench = _Bench(parts, payloads, structure, columns, motor, delays, band, block_s, outliers)
+    bench = _Bench(parts, payloads, structure, columns, motor, delays, band, block_s, recall)
     rows: ByClass | None = None
     if found.cutoff_hz is None:
         found, rows = bench.with_cutoff(found, rate, reasons)
@@ -184,7 +183,7 @@ def _with_decimation(
     rate: float,
     motor: bool,
     reasons: list[str],
-    outliers: Outliers,
+    recall: Recall,
 ) -> tuple[SignalSettings, float | None]:
     """With the band of the rows; and the upper edge of an earlier low-pass on the torques [Hz], None without."""
     edges = [
@@ -197,7 +196,7 @@ def _with_decimation(
     if settings.decimate_hz is not None:
         return settings, band
     stated = replace(settings, motor_delay_s=0.0)
-    rough = [prepare(session, stated, log=False, outliers=outliers) for session in sessions]
+    rough = [prepare(session, stated, log=False, recall=recall) for session in sessions]
     excitation = max(session.excitation_hz for session in rough)
     shortest = min(session.duration_s for session in sessions)
     wanted = {
@@ -228,14 +227,14 @@ class _Bench:
     delays: Sequence[float]
     band: float | None
     block_s: float
-    outliers: Outliers
+    recall: Recall
 
     def rows(self, settings: SignalSettings) -> ByClass:
         """Rows by side and joint."""
         parts: dict[str, list[BinnedRows]] = {}
         for session, payload, delay in zip(self.sessions, self.payloads, self.delays, strict=True):
             wanted = replace(settings, motor_delay_s=delay, reversal_s=0.0)
-            prepared = prepare(session, wanted, motor=self.motor, log=False, outliers=self.outliers)
+            prepared = prepare(session, wanted, motor=self.motor, log=False, recall=self.recall)
             for rows in observe_bins(prepared, payload, self.structure, self.columns, BIN_S):
                 parts.setdefault(rows.side, []).append(rows)
         found = {}

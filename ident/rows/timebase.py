@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -141,23 +140,6 @@ def _uniform(times: Floats, columns: tuple[Floats, ...], known: NDArray[np.int64
     nearest, before = (np.abs(grid - times[np.clip(k, 0, len(times) - 1)]) for k in (after, after - 1))
     bridged = np.minimum(nearest, before) > 1.0 * dt
     return Stretch(start, dt, count, bridged, True, columns, known, (times - start) / dt)
-
-
-Outliers = Callable[[Floats, float], tuple[BoolArray, list[int]]]
-
-
-class KnownOutliers:
-    """`flag_outliers` that remembers the flags of arrays it has seen; it keeps the arrays."""
-
-    def __init__(self) -> None:
-        self._found: dict[tuple[int, float], tuple[Floats, tuple[BoolArray, list[int]]]] = {}
-
-    def __call__(self, values: Floats, scale: float) -> tuple[BoolArray, list[int]]:
-        """Flags (n, k) and crowded columns of values (n, k)."""
-        key = id(values), scale
-        if key not in self._found:
-            self._found[key] = values, flag_outliers(values, scale)
-        return self._found[key][1]
 
 
 def flag_outliers(values: Floats, scale: float) -> tuple[BoolArray, list[int]]:

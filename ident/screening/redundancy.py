@@ -26,10 +26,10 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, Floats
 from ident.dynamics.regressor import rigid_regressor
 from ident.dynamics.structure import Coupling
+from ident.rows.content import Recall
 from ident.rows.filters import ParallelFilter, SignalSettings, block_means, thinning
 from ident.rows.prepare import TorqueChannel, prepare
 from ident.rows.sessions import payload_name
-from ident.rows.timebase import Outliers, flag_outliers
 from lwr_driver.session import Session
 
 Class = tuple[str, int]
@@ -86,7 +86,7 @@ def sampled(
     sessions: Sequence[Session],
     signals: SignalSettings,
     couplings: Sequence[tuple[int, int]] = (),
-    outliers: Outliers = flag_outliers,
+    recall: Recall | None = None,
 ) -> list[SampledRows]:
     """Rows of all sides of the sessions, without an estimated delay. Raises DataError like `prepare`."""
     found = []
@@ -94,7 +94,7 @@ def sampled(
         sensed = bool(session.joint.effort.shape[1])
         wanted = replace(signals, motor_delay_s=0.0)
         motor = session.motor is not None
-        whole = prepare(session, wanted, motor=motor, log=False, blocks=True, outliers=outliers)
+        whole = prepare(session, wanted, motor=motor, log=False, blocks=True, recall=recall)
         # Blocks of one stretch, side by side.
         runs: list[dict[str, list[SampledRows]]] = []
         for passage in whole.passages:
@@ -208,12 +208,12 @@ class Redundancy:
         signals: SignalSettings,
         couplings: Sequence[Coupling] = (),
         silent: frozenset[Class] = frozenset(),
-        outliers: Outliers = flag_outliers,
+        recall: Recall | None = None,
     ) -> Redundancy:
-        """Rows of the sessions, at most about `_MOST_ROWS` a side. outliers : as for `prepare`."""
+        """Rows of the sessions, at most about `_MOST_ROWS` a side. recall : as for `prepare`."""
         places = [tuple(chain.joint_names.index(name) for name in pair.joints) for pair in couplings]
         pairs = tuple((a, b) for a, b in places)
-        rows = sampled(sessions, signals, pairs, outliers)
+        rows = sampled(sessions, signals, pairs, recall)
         count = max((sum(len(r.q) for r in rows if r.side == side) for side in ("joint", "motor")), default=0)
         step = max(1, -(-count // _MOST_ROWS))
         return cls(chain, tuple(r.thinned(step) for r in rows), silent, pairs)

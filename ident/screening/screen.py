@@ -24,10 +24,9 @@ from ident.dynamics.parameters import INERTIAL, Floats
 from ident.dynamics.regressor import rigid_regressor, torque
 from ident.dynamics.structure import Coupling
 from ident.estimators.problem import Problem
-from ident.rows.content import Kept
+from ident.rows.content import Kept, Recall
 from ident.rows.filters import SignalSettings
 from ident.rows.sessions import payload_name
-from ident.rows.timebase import KnownOutliers, Outliers
 from ident.screening.channels import check_channels, check_limits, dead
 from ident.screening.doubts import Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, explain, is_wrong, unit_of
@@ -67,18 +66,18 @@ def screen(
     couplings: Sequence[Coupling] = (),
     *,
     motor: bool = True,
-    outliers: Outliers | None = None,
+    recall: Recall | None = None,
 ) -> tuple[Doubt, ...]:
     """Doubts about the channels of the sessions of one arm.
 
     signals : as for `prepare`. couplings : coupled joints of the motor side. motor : False asks for no doubt about the
-        motor torques; sound ones still tell of the other channels. outliers : as for `prepare`.
+        motor torques; sound ones still tell of the other channels. recall : as for `prepare`.
 
     Raises ConfigurationError for sessions of other joints than the chain's.
     """
     chosen = [session.select(chain.joint_names) for session in as_sessions(sessions)]
-    signals, outliers = signals or SignalSettings(), outliers or KnownOutliers()
-    look = partial(_doubts, outliers=outliers)
+    signals, recall = signals or SignalSettings(), recall or Recall()
+    look = partial(_doubts, recall=recall)
     found = _screened.of(look, chosen, chain, signals, tuple(couplings))
     if motor or not any("motor" in doubt.channel + doubt.seen for doubt in found):
         return found
@@ -94,13 +93,13 @@ def _doubts(
     signals: SignalSettings,
     couplings: Sequence[Coupling],
     *,
-    outliers: Outliers,
+    recall: Recall,
 ) -> tuple[Doubt, ...]:
     doubts, beyond = check_channels(chosen, chain), check_limits(chosen, chain)
     if any(doubt.certain for doubt in (*doubts, *beyond)):
         # A certain fault bends everything computed from it.
         return (*doubts, *beyond)
-    data = _rows(chosen, chain, signals, couplings, outliers)
+    data = _rows(chosen, chain, signals, couplings, recall)
     contradictions = [] if data is None else _contradictions(data, chosen)
     found = [doubt for doubt in contradictions if not _shared(doubt, doubts)]
     return (*doubts, *found, *(doubt for doubt in beyond if not _shared(doubt, found)))
@@ -111,13 +110,13 @@ def _rows(
     chain: Chain,
     signals: SignalSettings,
     couplings: Sequence[Coupling],
-    outliers: Outliers,
+    recall: Recall,
 ) -> Redundancy | None:
     """Rows of the sessions, at a higher rate for short ones; None for too few rows for a contradiction."""
     for factor in _RATES:
         faster = replace(signals, decimate_hz=min(factor * signals.decimate, 0.5 * signals.cutoff))
         try:
-            data = Redundancy.of(sessions, chain, faster, couplings, _silent(sessions), outliers)
+            data = Redundancy.of(sessions, chain, faster, couplings, _silent(sessions), recall)
         except LwrError as error:
             # The fit itself says what is too short or does not move.
             logger.info("no screening by redundancy at %g Hz: %s", faster.decimate_hz, error)
@@ -152,10 +151,10 @@ def require_sound(
     couplings: Sequence[Coupling] = (),
     *,
     motor: bool = True,
-    outliers: Outliers | None = None,
+    recall: Recall | None = None,
 ) -> list[str]:
     """Sentences of `screen` for the report. Raises DataError when a doubt is certain."""
-    return settle(screen(sessions, chain, signals, couplings, motor=motor, outliers=outliers))
+    return settle(screen(sessions, chain, signals, couplings, motor=motor, recall=recall))
 
 
 def _silent(sessions: Sequence[Session]) -> frozenset[Class]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import ModelStructure
 from ident.rows import signal_choice
-from ident.rows.content import Kept, content
+from ident.rows.content import Kept, Recall, content
 from ident.rows.filters import SignalSettings
 from ident.rows.signal_choice import choose_signals
 from lwr_driver.session import Session
@@ -67,6 +68,33 @@ def test_the_latest_results_are_kept() -> None:
     kept = Kept[int](2)
     assert [kept.of(double, value) for value in (1, 2, 1, 3, 1, 2)] == [2, 4, 2, 6, 2, 4]
     assert asked == [1, 2, 3, 2]
+
+
+def test_the_same_arrays_and_equal_figures_give_the_recalled_result() -> None:
+    recall, values = Recall(), np.arange(3.0)
+    first = recall.of(partial(np.multiply, values, 2.0), values, 2.0)
+    assert first.tolist() == [0.0, 2.0, 4.0]
+    assert recall.of(partial(np.multiply, values, 5.0), values, 2.0) is first
+    others: list[tuple[Any, ...]] = [
+        (np.multiply, values.copy(), 2.0), (np.multiply, values, 3.0), (np.add, values, 2.0)
+    ]  # fmt: skip
+    for make, *things in others:
+        assert recall.of(partial(make, *things), *things) is not first
+    assert Recall().of(partial(np.multiply, values, 2.0), values, 2.0) is not first
+
+
+def test_the_latest_results_of_a_function_are_recalled() -> None:
+    recall, values = Recall(), [np.full(2, 1.0), np.full(2, 2.0), np.full(2, 3.0)]
+
+    def found(make: Any, number: int) -> Any:
+        return recall.of(partial(make, values[number]), values[number], most=2)
+
+    first, second, other = found(np.negative, 0), found(np.negative, 1), found(np.positive, 2)
+    assert found(np.negative, 0) is first
+    found(np.negative, 2)
+    assert found(np.negative, 0) is first
+    assert found(np.negative, 1) is not second
+    assert found(np.positive, 2) is other
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from ident.dynamics.structure import DriveMotion, ModelStructure
 from ident.rows import observation
 from ident.rows.binned import _add_means, bins
 from ident.rows.class_rows import ClassRows
+from ident.rows.content import Recall
 from ident.rows.delay import Delay, DelayData, estimate_delay
 from ident.rows.filters import SignalSettings, half_width, low_pass, settling
 from ident.rows.prepare import (
@@ -26,7 +27,7 @@ from ident.rows.prepare import (
     prepare,
 )
 from ident.rows.signal_choice import _Bench, _excerpt, _reversal_s, _with_decimation
-from ident.rows.timebase import flag_outliers, stretches
+from ident.rows.timebase import stretches
 from lwr_driver.session import Phase
 from tests.ident import estimation_arm as arm
 
@@ -325,7 +326,7 @@ def test_an_earlier_filter_of_the_motor_torques_counts_where_these_are_used(moto
     spectrum[np.fft.rfftfreq(len(session.motor), 0.004) > 8.0] = 0.0
     smooth = np.fft.irfft(spectrum, len(session.motor), axis=0)
     session = replace(session, motor=replace(session.motor, effort=smooth))
-    found = _with_decimation(FIVE_HZ, [session], 250.0, motor, [], flag_outliers)
+    found = _with_decimation(FIVE_HZ, [session], 250.0, motor, [], Recall())
     assert found == (FIVE_HZ, pytest.approx(8.0, abs=0.5) if band else None)
 
 

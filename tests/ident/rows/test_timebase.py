@@ -7,7 +7,6 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from ident.rows.timebase import (
-    KnownOutliers,
     _beyond,
     _displaced,
     _least_step,
@@ -103,16 +102,6 @@ def test_a_sample_is_beyond_the_limit_of_its_block_and_the_common_one() -> None:
     # On the limit is not beyond it.
     assert not _beyond(distance, np.array([2.0, 2.0]), 0.0).any()
     assert not _beyond(distance, np.array([0.0, 0.0]), 2.0).any()
-
-
-def test_known_outliers_are_found_once_for_an_array_and_a_scale() -> None:
-    known, values = KnownOutliers(), np.random.default_rng(0).normal(size=(300, 2))
-    values[100, 1] = 9.0
-    first = known(values, 8.0)
-    assert known(values, 8.0) is first
-    np.testing.assert_array_equal(first[0], flag_outliers(values, 8.0)[0])
-    assert known(values, 2.0) is not first
-    assert known(values.copy(), 8.0) is not first
 
 
 def time_of(count: int) -> Array:
