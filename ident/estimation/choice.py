@@ -519,8 +519,13 @@ class _Comparison:
         weak = np.diag(self._completed.precision - self._stated.precision) / scale
         matrix = np.vstack([root[:, :p], np.diag(np.sqrt(np.maximum(weak, 0.0)))])
         target = np.append(root[:, p], np.zeros(p))
-        standard = PhysicallyConsistent(self.bodies).solve(scale, matrix @ self.bodies.projection, target)
+        standard = self._physical.solve(scale, matrix @ self.bodies.projection, target)
         return np.concatenate([self.bodies.projection @ standard, values[p:]])
+
+    @cached_property
+    def _physical(self) -> PhysicallyConsistent:
+        assert self.bodies is not None
+        return PhysicallyConsistent(self.bodies)
 
     @cached_property
     def _stated(self) -> Prior:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar, Literal
 
 import clarabel
@@ -205,48 +206,49 @@ class PhysicallyConsistent:
         spread = np.zeros((quadratic.shape[1], len(size)))
         spread[used] = solve_triangular(r, np.eye(len(size))) / size[:, None]
         best = np.asarray(spread @ (q.T @ wanted))
-        if self._feasible(best):
-            return best
-        rows, offset, cones = self._constraints()
+        rows, offset = self._constraints
         left = offset - rows @ best
         # What nothing knows has no such unit: there it is one that the constraints feel.
         felt = np.linalg.norm(rows @ spread, axis=0)
         unit = np.minimum(1.0, _FELT / np.maximum(felt, 1e-300))
         try:
-            moved = _conic(
-                sparse.diags(unit**2, format="csc"), np.zeros(len(size)), rows @ (spread * unit), left, cones
-            )
+            moved = self._moved(sparse.diags(unit**2, format="csc"), rows @ (spread * unit), left)
             return np.asarray(best + (spread * unit) @ moved)
         except DataError:
             # So far from the possible that these units are of no use: each parameter in its own.
             own = np.zeros((quadratic.shape[1], len(size)))
             own[used] = np.diag(1.0 / size)
             curvature = sparse.csc_matrix(np.triu(r.T @ r))
-            return np.asarray(best + own @ _conic(curvature, np.zeros(len(size)), rows @ own, left, cones))
+            return np.asarray(best + own @ self._moved(curvature, rows @ own, left))
 
-    def _feasible(self, standard: Floats) -> bool:
-        """Whether standard parameters (n,) keep all constraints."""
-        prior = self.prior
-        bodies = zip(prior.bodies, prior.inertial, strict=True)
-        return bool(np.all(standard[prior.nonnegative] >= 0.0)) and all(
-            np.linalg.eigvalsh(
-                pseudo_inertia(standard[places]) - self.margin * _smallest(pseudo_inertia(body))
-            )[0]
-            >= 0.0
-            for places, body in bodies
-        )
+    def _moved(self, curvature: sparse.csc_matrix, rows: Floats, left: Floats) -> Floats:
+        """The least x^T curvature x with left - rows x within all constraints.
 
-    def _constraints(self) -> tuple[Floats, Floats, list]:
+        Most of them hold by themselves: only those that the least one so far breaks are in the program.
+        """
+        signs, bodies = len(self.prior.nonnegative), len(self.prior.bodies)
+        used, x = np.zeros(signs + bodies, dtype=bool), np.zeros(rows.shape[1])
+        while True:
+            slack = left - rows @ x
+            smallest = np.linalg.eigvalsh(_of_svec(slack[signs:].reshape(bodies, _BODY)))[:, 0]
+            broken = (np.concatenate([slack[:signs], smallest]) < 0.0) & ~used
+            if not broken.any():
+                return x
+            used |= broken
+            chosen = np.repeat(used, [1] * signs + [_BODY] * bodies)
+            count = int(used[:signs].sum())
+            cones = [clarabel.NonnegativeConeT(count)] if count else []
+            cones += [clarabel.PSDTriangleConeT(4)] * int(used[signs:].sum())
+            x = _conic(curvature, np.zeros(len(x)), rows[chosen], left[chosen], cones)
+
+    @cached_property
+    def _constraints(self) -> tuple[Floats, Floats]:
         """Rows of A x + s = b: parameters without negative values, and each body's pseudo-inertia above its floor, as
         seen from the prior's own, where all bodies are of one size."""
         prior, n = self.prior, self.prior.projection.shape[1]
         sign = np.zeros((len(prior.nonnegative), n))
         sign[np.arange(len(prior.nonnegative)), prior.nonnegative] = -1.0
-        parts, offsets, cones = (
-            [sign],
-            [np.zeros(len(sign))],
-            [clarabel.NonnegativeConeT(len(sign))] if len(sign) else [],
-        )
+        parts, offsets = [sign], [np.zeros(len(sign))]
         basis = pseudo_inertia(np.eye(_BODY))
         for places, body in zip(prior.bodies, prior.inertial, strict=True):
             matrix = pseudo_inertia(body)
@@ -255,8 +257,7 @@ class PhysicallyConsistent:
             rows[:, places] = -_svec(inverse @ basis @ inverse.T).T
             parts.append(rows)
             offsets.append(-_svec(inverse @ (self.margin * _smallest(matrix)) @ inverse.T))
-            cones.append(clarabel.PSDTriangleConeT(4))
-        return np.vstack(parts), np.concatenate(offsets), cones
+        return np.vstack(parts), np.concatenate(offsets)
 
     def _entropic(self, scale: float, quadratic: Floats, target: Floats) -> Floats:
         """`solve` with the divergence -log det(J J0^-1) + tr(J0^-1 J) - 4 of each body."""
@@ -359,6 +360,15 @@ def _svec(matrix: Floats) -> Floats:
     size = matrix.shape[-1]
     entries = [matrix[..., i, j] * (1.0 if i == j else _ROOT2) for j in range(size) for i in range(j + 1)]
     return np.stack(entries, axis=-1)
+
+
+def _of_svec(entries: Floats) -> Floats:
+    """Symmetric matrices (..., 4, 4) of `_svec`."""
+    matrix = np.empty((*entries.shape[:-1], 4, 4))
+    places = [(i, j) for j in range(4) for i in range(j + 1)]
+    for k, (i, j) in enumerate(places):
+        matrix[..., i, j] = matrix[..., j, i] = entries[..., k] / (1.0 if i == j else _ROOT2)
+    return matrix
 
 
 def _psd_rows(places: np.ndarray, width: int, floor: Floats) -> tuple[Floats, Floats, list]:

@@ -27,7 +27,7 @@ from ident.estimators import (
 )
 from ident.estimators.covariance import jackknife
 from ident.estimators.names import SUMMARIES
-from ident.estimators.physical import _compact, _sizes, _svec, _touching, cad_prior
+from ident.estimators.physical import _compact, _of_svec, _sizes, _svec, _touching, cad_prior
 from ident.estimators.prior import Disagreement
 from ident.estimators.recursive import _mix, instants
 from ident.estimators.registry import ESTIMATORS
@@ -301,6 +301,9 @@ def test_the_triangle_of_a_cone_keeps_the_product_of_matrices() -> None:
     a, b = (m + m.T for m in random.normal(size=(2, 4, 4)))
     assert _svec(a) @ _svec(b) == pytest.approx(float(np.trace(a @ b)))
     np.testing.assert_allclose(_svec(np.diag([1.0, 2.0, 3.0]))[[0, 2, 5]], [1.0, 2.0, 3.0])
+    both = np.arange(32.0).reshape(2, 4, 4)
+    both = both + both.swapaxes(1, 2)
+    np.testing.assert_allclose(_of_svec(_svec(both)), both)
 
 
 def test_the_size_of_a_body_is_that_of_its_mass_and_inertia() -> None:
