@@ -208,11 +208,17 @@ def choose(
     plain = replace(settings, estimator="map" if prior else "wls", essential=None)
     require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
     rows = observed(sessions, chain, plain, known=known)
-    first = rows.identified(rows.settings)
+    # With a prior the covariance is the posterior's, whatever the settings.
+    first = rows.identified(replace(rows.settings, covariance=_PLAIN) if prior else rows.settings)
     choice = compared(first, sessions, tilt=tilt, recall=rows.recall)
     winner = choice.winner
     options: dict[str, Any] = {"prior_strength": winner.prior_scale} if winner.estimator == "physical" else {}
-    settled = replace(first.settings, estimator=settings.estimator, essential=settings.essential)
+    settled = replace(
+        first.settings,
+        estimator=settings.estimator,
+        essential=settings.essential,
+        covariance=settings.covariance,
+    )
     final = replace(settled, estimator=estimator_factory(winner.estimator, **options))
     sessions = [_calibrated(session, choice.gains) for session in sessions]
     if winner.tilt:
