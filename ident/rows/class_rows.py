@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -36,6 +37,20 @@ class ClassRows:
     block: NDArray[np.int64]
     parts: tuple[BinnedRows, ...]
     stretches: tuple[slice, ...]
+
+    @cached_property
+    def acting(self) -> NDArray[np.int64]:
+        """Columns that are not zero: the joint's own and those of the links behind it."""
+        return np.flatnonzero(self.matrix.any(axis=0))
+
+    @cached_property
+    def narrow(self) -> Floats:
+        """The matrix with the columns `acting` alone."""
+        return self.matrix[:, self.acting]
+
+    def fitted(self, values: Floats) -> Floats:
+        """Torque (m,) of the rows by the parameters (p,)."""
+        return self.narrow @ values[self.acting]
 
     @property
     def even(self) -> NDArray[np.bool_]:
@@ -78,13 +93,15 @@ class Moments:
     @classmethod
     def of(cls, rows: ByClass, masks: Masks) -> Moments:
         """Sums over the masked rows."""
-        parts = [(own.matrix[masks[key]], own.torque[masks[key]]) for key, own in rows.items()]
-        return cls(
-            np.array([matrix.T @ matrix for matrix, _ in parts]),
-            np.array([matrix.T @ torque for matrix, torque in parts]),
-            np.array([torque @ torque for _, torque in parts]),
-            np.array([len(torque) for _, torque in parts], dtype=np.float64),
-        )
+        width = next(iter(rows.values())).matrix.shape[1]
+        gram, target = np.zeros((len(rows), width, width)), np.zeros((len(rows), width))
+        square, count = np.zeros(len(rows)), np.zeros(len(rows))
+        for c, (key, own) in enumerate(rows.items()):
+            matrix, torque = own.narrow[masks[key]], own.torque[masks[key]]
+            gram[c][np.ix_(own.acting, own.acting)] = matrix.T @ matrix
+            target[c, own.acting] = matrix.T @ torque
+            square[c], count[c] = torque @ torque, len(torque)
+        return cls(gram, target, square, count)
 
     def __add__(self, other: Moments) -> Moments:
         return Moments(
@@ -138,6 +155,6 @@ def error(rows: ByClass, values: Floats, masks: Masks) -> float:
     for key, own in rows.items():
         used = masks[key] & ~own.even
         if used.sum() >= LEAST:
-            residual = own.torque[used] - own.matrix[used] @ values
+            residual = (own.torque - own.fitted(values))[used]
             logs.append(0.5 * float(np.log(np.mean(residual**2) + 1e-300)))
     return float(np.mean(logs)) if logs else 0.0

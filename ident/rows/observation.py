@@ -24,6 +24,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.estimators.problem import Nuisance, Problem, RowGroup
+from ident.rows.binned import is_zero
 from ident.rows.filters import (
     ParallelFilter,
     block_means,
@@ -260,9 +261,11 @@ def _known_means(table, known, factor):  # type: ignore[no-untyped-def]
     """Means (C n, m // factor) over neighbouring samples of (C, n, m) columns times the known share (n, m)."""
     columns, joints, samples = table.shape
     count = samples // factor
-    result = np.empty((columns * joints, count))
+    result = np.zeros((columns * joints, count))
     for column in range(columns):
         for joint in range(joints):
+            if is_zero(table[column, joint]):
+                continue
             row = column * joints + joint
             for k in range(count):
                 total = 0.0

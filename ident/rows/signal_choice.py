@@ -425,16 +425,17 @@ def _chance(rows: ByClass, fitted: Moments, masks: Masks, far: Masks, both: bool
     """
     values, weights = fitted.solved()
     columns = {key: np.sign(own.speed) * (masks[key] & ~far[key]) for key, own in rows.items()}
-    products = np.array([own.matrix.T @ columns[key] for key, own in rows.items()])
+    products = np.zeros((len(rows), len(values)))
+    for product, (key, own) in zip(products, rows.items(), strict=True):
+        product[own.acting] = own.narrow.T @ columns[key]
     shared = fitted.divided(weights, (weights[:, None] * products).T)
     squares = []
     for (key, own), others in zip(rows.items(), shared.T, strict=True):
         if np.count_nonzero(columns[key]) < LEAST:
             continue
         used = masks[key]
-        matrix = own.matrix[used]
-        free = columns[key][used] - matrix @ others
-        sums = np.bincount(own.block[used], free * (own.torque[used] - matrix @ values))
+        free, rest = columns[key] - own.fitted(others), own.torque - own.fitted(values)
+        sums = np.bincount(own.block[used], (free * rest)[used])
         more = float(np.sum(sums))
         square = more * more if both else more * abs(more)
         squares.append(square / max(float(sums @ sums), 1e-300))

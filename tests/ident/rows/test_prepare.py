@@ -258,6 +258,7 @@ def test_a_row_next_to_unknown_is_not_blown_up() -> None:
 def test_means_of_known_samples_are_taken_over_all_samples(factor: int) -> None:
     random = np.random.default_rng(0)
     table, known = random.normal(size=(2, 3, 17)), random.integers(0, 2, (3, 17)).astype(float)
+    table[0, 1], table[1, 0, 0], table[1, 2, :16] = 0.0, 0.0, 0.0
     found = observation._known_means(table, known, factor)
     count = 17 // factor
     expected = (table * known)[:, :, : count * factor].reshape(6, count, factor).mean(axis=2)
