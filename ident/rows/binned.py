@@ -18,7 +18,7 @@ from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Coulomb, DriveMotion, ModelStructure, Side
 from ident.rows.prepare import PreparedSession, TorqueChannel
 
-_CHUNK = 1000
+_CHUNK = 500
 
 
 @dataclass(frozen=True)

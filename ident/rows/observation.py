@@ -65,8 +65,8 @@ class Columns(Protocol):
         """Observation matrix, as `ModelStructure.regressor`."""
 
 
-# Rows with their full-rate regressor in memory at a time.
-_BLOCKS = 4
+# Blocks of rows filtered at a time, and samples with their regressor in memory.
+_BLOCKS, _CHUNK = 4, 500
 
 
 def observe(
@@ -232,9 +232,10 @@ def _filtered(
     times, torque = block_means(channel.times, factor), block_means(channel.torque * known, factor)
     share = block_means(known, factor)
     blocks = ParallelFilter(times, rows, settings.decimate, settings.attenuation_db).blocks()
-    while batch := list(islice(blocks, _BLOCKS)):
-        low, high = batch[0][1].start, batch[-1][1].stop
-        part = slice(low * factor, high * factor)
+
+    def means(first: int, last: int) -> Floats:
+        """Means of the regressor's columns (C n, last - first)."""
+        part = slice(first * factor, last * factor)
         wide = structure.regressor(
             channel.q[part],
             channel.qd[part],
@@ -246,7 +247,17 @@ def _filtered(
         )
         # The regressor's memory runs (column, joint, sample): one product filters all columns.
         table = wide.T.reshape(len(columns), joints, -1)
-        flat = _known_means(table, np.ascontiguousarray(known[part].T), factor)
+        found: Floats = _known_means(table, np.ascontiguousarray(known[part].T), factor)
+        return found
+
+    step = max(1, _CHUNK // factor)
+    flat, low, done = np.zeros((len(columns) * joints, 0)), 0, 0
+    while batch := list(islice(blocks, _BLOCKS)):
+        # What the batch before needed of these means stays.
+        high, start = batch[-1][1].stop, batch[0][1].start
+        flat, low, done = flat[:, start - low :], start, max(start, done)
+        new = [means(first, min(first + step, high)) for first in range(done, high, step)]
+        flat, done = np.hstack([flat, *new]), max(high, done)
         for outputs, samples, weights in batch:
             inside = slice(samples.start - low, samples.stop - low)
             filtered = (flat[:, inside] @ weights.T).reshape(len(columns), joints, -1)
