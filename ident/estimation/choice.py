@@ -503,14 +503,14 @@ class _Comparison:
         """Squared errors (parts, classes) with some of the columns; the conic program's with its scale `physical`."""
         found = np.empty(self.held.shape[:2])
         columns = np.append(used, self.total.shape[-1] - 1)
-        inner = np.ix_(columns, columns)
+        inner, vector = np.ix_(columns, columns), np.zeros(self.total.shape[-1])
         for part, (held, near) in enumerate(zip(self.held, self.near, strict=True)):
             normal = np.einsum("c,cij->ij", weights, self.total - near)[inner]
             values = _solution(normal, prior)
             if physical is not None:
                 values = self._consistent(normal, values, physical)
-            vector = np.append(-values, 1.0)
-            found[part] = [max(float(vector @ square[inner] @ vector), 0.0) for square in held]
+            vector[columns] = np.append(-values, 1.0)
+            found[part] = np.maximum(held @ vector @ vector, 0.0)
         return found
 
     def _consistent(self, normal: Floats, values: Floats, scale: float) -> Floats:
@@ -523,8 +523,9 @@ class _Comparison:
         power, vectors = np.linalg.eigh(shift.T @ normal @ shift)
         root = np.sqrt(np.maximum(power, 0.0))[:, None] * vectors.T
         weak = np.diag(self._completed.precision - self._stated.precision) / scale
-        matrix = np.vstack([root[:, :p], np.diag(np.sqrt(np.maximum(weak, 0.0)))])
-        target = np.append(root[:, p], np.zeros(p))
+        open_ = np.diag(np.sqrt(np.maximum(weak, 0.0)))[weak > 0.0]
+        matrix = np.vstack([root[:, :p], open_])
+        target = np.append(root[:, p], np.zeros(len(open_)))
         standard = self._physical.solve(scale, matrix @ self.bodies.projection, target)
         return np.concatenate([self.bodies.projection @ standard, values[p:]])
 

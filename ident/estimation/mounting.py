@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -277,14 +278,23 @@ class _Leaning:
         """All of them."""
         return np.ones(len(self.chains), dtype=bool)
 
+    @cached_property
+    def _bodies(self) -> dict[str | None, Floats]:
+        """Inertial parameters (n, 10) by payload."""
+        found = {
+            payload: np.zeros((self.chain.n, len(INERTIAL))) for payload in (None, *self.structure.payloads)
+        }
+        for payload, bodies in found.items():
+            for column, value in zip(self.columns.tolist(), self.values, strict=True):
+                if (place := self.structure.rigid_of(column, payload)) is not None:
+                    bodies[place] += value
+        return found
+
     def regressor(
         self, q: Floats, qd: Floats, qdd: Floats, *, payload: str | None, sides: Sequence[Side], **rest: Any
     ) -> Floats:
         """(sides x n x N, gravities): as `ModelStructure.regressor`, at rest."""
-        bodies = np.zeros((self.chain.n, len(INERTIAL)))
-        for column, value in zip(self.columns.tolist(), self.values, strict=True):
-            if (place := self.structure.rigid_of(column, payload)) is not None:
-                bodies[place] += value
+        bodies = self._bodies[payload]
         still = np.zeros_like(q)
         torques = [torque(chain, q, still, still, bodies).T for chain in self.chains]
         return np.array([[own] * len(sides) for own in torques]).reshape(len(torques), -1).T

@@ -201,11 +201,13 @@ class PhysicallyConsistent:
         # A trace of curvature makes the solution unique for parameters without effect and prior.
         stacked = np.vstack([matrix[:, used] / size, 1e-10 * np.eye(len(size))])
         wanted = np.concatenate([target, root @ prior.standard, np.zeros(len(size))])
-        q, r = np.linalg.qr(stacked)
+        # The last column becomes Q^T wanted.
+        whole = np.asarray(np.linalg.qr(np.column_stack([stacked, wanted]), mode="r"), dtype=np.float64)
+        r, turned = whole[:-1, :-1], whole[:-1, -1]
         # Deviations from the minimiser, in units in which they cost the same: there the solver's digits suffice.
         spread = np.zeros((quadratic.shape[1], len(size)))
         spread[used] = solve_triangular(r, np.eye(len(size))) / size[:, None]
-        best = np.asarray(spread @ (q.T @ wanted))
+        best = np.asarray(spread @ turned)
         rows, offset = self._constraints
         left = offset - rows @ best
         # What nothing knows has no such unit: there it is one that the constraints feel.
