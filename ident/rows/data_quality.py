@@ -270,7 +270,10 @@ def clipped_at(columns: JointColumns) -> Floats:
     fresh &= ~_same(effort)
     for joint in range(n):
         values = effort[fresh, joint]
-        ends = [abs(v) for v, _ in _flat(values) if v in (values.min(), values.max())]
+        extremes = (values.min(), values.max()) if len(values) else ()
+        if not any(np.count_nonzero(values == extreme) >= _FLAT for extreme in extremes):
+            continue
+        ends = [abs(v) for v, _ in _flat(values) if v in extremes]
         if ends:
             found[joint] = max(ends)
     return found

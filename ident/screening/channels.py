@@ -42,6 +42,8 @@ _OVER, _OUTLIERS = 1.1, 0.001
 _CORNERS, _TOP, _SHARP, _LAG_S = 2, 5, 2.0, 0.02
 # Share of the motion at one torque, wherever it is.
 _OFTEN = 0.05
+# Samples within which the torques of nearly all sensors change.
+_SOON = 100
 # Least time [s] of torques kept in all joints at once to be told; shorter ones are usual in a network.
 _TOGETHER_S = 0.1
 
@@ -91,7 +93,9 @@ def dead(columns: JointColumns | None) -> tuple[int, ...]:
     """Joints (from 0) with one and the same torque in all samples."""
     if columns is None or not columns.effort.size:
         return ()
-    return tuple(int(j) for j in np.flatnonzero(np.ptp(columns.effort, axis=0) == 0.0))
+    effort = columns.effort
+    quiet = np.flatnonzero(np.all(effort[:_SOON] == effort[0], axis=0))
+    return tuple(int(j) for j in quiet if np.ptp(effort[:, j]) == 0.0)
 
 
 def _torques(session: Session) -> Iterator[tuple[str, JointColumns]]:
