@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -26,6 +25,8 @@ _ROUNDS = 3
 class ClassRows:
     """Rows of one joint and side of all sessions.
 
+    matrix : (m, a), the columns `acting` (a,) of the `width` p of the model, those that are not zero: the joint's own
+    and those of the links behind it. torque, speed : (m,).
     measured : (m,), neither bridged nor outliers. block : (m,), number of its block. parts, stretches : the rows of all
     joints of each stretch, and their places here.
     """
@@ -37,20 +38,12 @@ class ClassRows:
     block: NDArray[np.int64]
     parts: tuple[BinnedRows, ...]
     stretches: tuple[slice, ...]
-
-    @cached_property
-    def acting(self) -> NDArray[np.int64]:
-        """Columns that are not zero: the joint's own and those of the links behind it."""
-        return np.flatnonzero(self.matrix.any(axis=0))
-
-    @cached_property
-    def narrow(self) -> Floats:
-        """The matrix with the columns `acting` alone."""
-        return self.matrix[:, self.acting]
+    acting: NDArray[np.int64]
+    width: int
 
     def fitted(self, values: Floats) -> Floats:
         """Torque (m,) of the rows by the parameters (p,)."""
-        return self.narrow @ values[self.acting]
+        return self.matrix @ values[self.acting]
 
     @property
     def even(self) -> NDArray[np.bool_]:
@@ -93,11 +86,11 @@ class Moments:
     @classmethod
     def of(cls, rows: ByClass, masks: Masks) -> Moments:
         """Sums over the masked rows."""
-        width = next(iter(rows.values())).matrix.shape[1]
+        width = next(iter(rows.values())).width
         gram, target = np.zeros((len(rows), width, width)), np.zeros((len(rows), width))
         square, count = np.zeros(len(rows)), np.zeros(len(rows))
         for c, (key, own) in enumerate(rows.items()):
-            matrix, torque = own.narrow[masks[key]], own.torque[masks[key]]
+            matrix, torque = own.matrix[masks[key]], own.torque[masks[key]]
             gram[c][np.ix_(own.acting, own.acting)] = matrix.T @ matrix
             target[c, own.acting] = matrix.T @ torque
             square[c], count[c] = torque @ torque, len(torque)

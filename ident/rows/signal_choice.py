@@ -245,8 +245,10 @@ class _Bench:
             for j in range(self.structure.chain.n):
                 measured = np.concatenate([rows.measured[:, j] for rows in some])
                 if measured.any():
+                    used = [rows.matrix[j].any(axis=0) for rows in some]
+                    acting = np.flatnonzero(np.any(used, axis=0))
                     found[side, j] = ClassRows(
-                        np.concatenate([self._smooth(rows.matrix[j], rows) for rows in some]),
+                        np.concatenate([self._smooth(rows.matrix[j][:, acting], rows) for rows in some]),
                         np.concatenate(
                             [self._smooth(rows.torque[:, j : j + 1], rows)[:, 0] for rows in some]
                         ),
@@ -255,6 +257,8 @@ class _Bench:
                         block,
                         tuple(some),
                         stretches,
+                        acting,
+                        len(self.columns),
                     )
         return found
 
@@ -329,8 +333,9 @@ class _Bench:
             turned = np.concatenate(
                 [self._smooth(turned_by[id(part)][:, j : j + 1], part)[:, 0] for part in own.parts]
             )
-            for place, (symbol, link, *_) in enumerate(names):
-                if symbol in ("Fcl", "Fcm") and link == j + 1 and np.any(matrix[:, place]):
+            for place, column in enumerate(own.acting):
+                symbol, link, _ = names[column]
+                if symbol in ("Fcl", "Fcm") and link == j + 1:
                     matrix[:, place] = turned
             found[side, j] = replace(own, matrix=matrix)
         return found
@@ -427,7 +432,7 @@ def _chance(rows: ByClass, fitted: Moments, masks: Masks, far: Masks, both: bool
     columns = {key: np.sign(own.speed) * (masks[key] & ~far[key]) for key, own in rows.items()}
     products = np.zeros((len(rows), len(values)))
     for product, (key, own) in zip(products, rows.items(), strict=True):
-        product[own.acting] = own.narrow.T @ columns[key]
+        product[own.acting] = own.matrix.T @ columns[key]
     shared = fitted.divided(weights, (weights[:, None] * products).T)
     squares = []
     for (key, own), others in zip(rows.items(), shared.T, strict=True):
