@@ -389,11 +389,11 @@ def effective_rows(problem: Problem, residuals: Sequence[Floats]) -> Floats:
             group = problem.groups[index]
             if not len(group.target):
                 continue
-            series = np.zeros(int(group.time_index[-1] - group.time_index[0]) + 1)
+            span = int(group.time_index[-1] - group.time_index[0]) + 1
+            lags = min(span, max(64, span // 3))
+            series = np.zeros(next_fast_len(span + lags, real=True))
             series[group.time_index - group.time_index[0]] = residuals[index]
-            lags = min(len(series), max(64, len(series) // 3))
-            size = next_fast_len(len(series) + lags, real=True)
-            correlation = irfft(np.abs(rfft(series, size)) ** 2, size)[:lags]
+            correlation = irfft(np.abs(rfft(series)) ** 2, len(series))[:lags]
             if len(correlation) > len(total):
                 total = np.pad(total, (0, len(correlation) - len(total)))
             total[: len(correlation)] += correlation

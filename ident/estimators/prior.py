@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -53,6 +54,16 @@ class Prior:
             raise ConfigurationError(
                 "prior precision is not positive semi-definite; it is an inverse covariance"
             )
+
+    @cached_property
+    def root(self) -> Floats:
+        """(k, p) with root^T root the precision, without its zero directions."""
+        # Parameters of different units differ by many orders of magnitude.
+        scale = np.sqrt(np.maximum(np.diag(self.precision), 0.0))
+        size = np.where(scale > 0.0, scale, 1.0)
+        values, vectors = np.linalg.eigh(self.precision / np.outer(size, size))
+        keep = values > 1e-12 * max(values.max(initial=0.0), 1e-300)
+        return np.asarray(np.sqrt(values[keep])[:, None] * vectors[:, keep].T * size)
 
     @classmethod
     def independent(cls, mean: Floats, std: Floats) -> Prior:
@@ -101,7 +112,7 @@ class Prior:
         """
         factor = problem.weighted(1.0 / np.maximum([c.factor.mean_square for c in problem.classes], 1e-300))
         norms = np.linalg.norm(factor.r[:, :-1], axis=0)
-        penalty = _root_of(self.precision)
+        penalty = self.root
         stacked = np.asarray(np.linalg.qr(np.vstack([factor.r[:, :-1], penalty]), mode="r"))
         if np.all(np.abs(np.diag(stacked)) > 1e-10 * np.linalg.norm(stacked, axis=0)):
             return self
@@ -333,19 +344,10 @@ def _shares(problem: Problem, values: Floats) -> Floats:
     return np.minimum(effective_rows(problem, problem.residuals(values)) / rows, 1.0)
 
 
-def _root_of(precision: Floats) -> Floats:
-    # Parameters of different units differ by many orders of magnitude.
-    scale = np.sqrt(np.maximum(np.diag(precision), 0.0))
-    size = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(precision / np.outer(size, size))
-    keep = values > 1e-12 * max(values.max(initial=0.0), 1e-300)
-    return np.sqrt(values[keep])[:, None] * vectors[:, keep].T * size
-
-
 def _posterior(problem: Problem, prior: Prior, weights: Floats, scale: float) -> tuple[Floats, Floats]:
     """Values (p,) and root (p, p) with root root^T the posterior covariance."""
     r = problem.weighted(weights).r
-    penalty = _root_of(prior.precision) / np.sqrt(scale)
+    penalty = prior.root / np.sqrt(scale)
     stacked = np.vstack([r, np.column_stack([penalty, penalty @ prior.mean])])
     factor = np.asarray(np.linalg.qr(stacked, mode="r"), dtype=np.float64)
     p = len(prior.mean)
@@ -360,7 +362,7 @@ def _evidence_cost(problem: Problem, prior: Prior, weights: Floats) -> Callable[
     """Minus the log marginal likelihood as a function of log s."""
     r = problem.weighted(weights).r
     p = len(prior.mean)
-    penalty = _root_of(prior.precision)
+    penalty = prior.root
 
     def cost(log_scale: float) -> float:
         firm = penalty * np.exp(-0.5 * log_scale)
