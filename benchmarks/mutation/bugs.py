@@ -175,8 +175,8 @@ BUGS: tuple[Bug, ...] = (
     Bug(
         "samples of a frozen position stay in the rows",
         "ident/rows/prepare.py",
-        "| old | unseen",
-        "| old",
+        "| seen.stale | unseen",
+        "| seen.stale",
         ("tests/ident/screening/test_screen.py::test_samples_of_a_short_freeze_have_no_part_in_the_rows",),
     ),
     Bug(
