@@ -195,10 +195,19 @@ gear_ratio_option = click.option(
 )
 
 
+stiffness_option = click.option(
+    "--stiffness",
+    metavar="K[,K...]",
+    help="Of the joints [Nm/rad], one for all or one per joint, known within a factor of two; default: from the arm "
+    "file.",
+)
+
+
 def arm_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The options of a diagnosis on its arm: `arm`, `urdf`, `coupling`, `gear_ratio`."""
+    """The options of a diagnosis on its arm: `arm`, `urdf`, `coupling`, `gear_ratio`, `stiffness`."""
     about = "Arm file (stiffness, gear ratios); default: the one of the sessions' robot."
     for option in (
+        stiffness_option,
         gear_ratio_option,
         coupling_option,
         click.option("--urdf", type=PATH, help="Kinematics; default: the one in the first session."),

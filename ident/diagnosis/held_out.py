@@ -10,8 +10,8 @@ import numpy as np
 from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
 
 _DRAWS = 1000
-# A rise of an error by less is felt by nobody, however sure: all rows share base parameters.
-_FELT_WORSE = 0.01
+FELT_WORSE = 0.01
+"""A rise of an error by a smaller share is felt by nobody, however sure: all rows share base parameters."""
 # A rise beyond this counts, though it came from a single block.
 _MUCH_WORSE = 0.05
 
@@ -104,7 +104,7 @@ def worse_rows(before: HeldOut, after: HeldOut, seed: int) -> list[Key]:
     return [
         key
         for key, (a, b, _, high) in found.items()
-        if b > (1.0 + (_FELT_WORSE if high < 0.0 else _MUCH_WORSE)) * a
+        if b > (1.0 + (FELT_WORSE if high < 0.0 else _MUCH_WORSE)) * a
     ]
 
 

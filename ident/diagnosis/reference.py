@@ -286,7 +286,7 @@ class Reference:
         precision[np.ix_(here, here)] = np.linalg.inv(covariance)
         mean = np.zeros(len(base))
         mean[here] = values
-        for k, mass in _announced(base, masses).items():
+        for k, (_, mass) in announced_masses(base, masses).items():
             if k not in here:
                 precision[k, k], mean[k] = 1.0 / (_WEIGHED * mass) ** 2, mass
         return precision, mean
@@ -415,12 +415,12 @@ def _with_payload(base: BaseSet, column: int, other: set[str]) -> str:
     return f"{name.rstrip('0123456789')} of {title}{' before' if title in other else ''}"
 
 
-def _announced(base: BaseSet, masses: Mapping[str, float | None]) -> dict[int, float]:
-    """Announced mass [kg] by place of the base parameters that are the mass of a payload."""
+def announced_masses(base: BaseSet, masses: Mapping[str, float | None]) -> dict[int, tuple[str, float]]:
+    """Payload and announced mass [kg] by place of the base parameters that are the mass of a payload."""
     found = {}
     for k in range(len(base)):
         terms = _combination(base, k, set())
         for payload, mass in masses.items():
             if mass and terms == ((f"M of {payload}", 1.0),):
-                found[k] = float(mass)
+                found[k] = payload, float(mass)
     return found

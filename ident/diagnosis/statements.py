@@ -25,6 +25,7 @@ from ident.diagnosis.claims_in_words import (
     finding_statement,
     wrapped,
 )
+from ident.diagnosis.held_out import FELT_WORSE
 from ident.effects.words import spoken
 from lwr_driver.listing import Listing, Piece, text_of
 
@@ -301,6 +302,8 @@ def _lines(
         text = f"{error_change(gain)} error on held-out data on average, {place} {error_change(best)}"
         worse = _worse(details, names)
         text += f"; worse: {', '.join(worse)}" if worse else ""
+        if findings and content.get("extension") == []:
+            text = "the base model: no cause here lasts and lessens the error of held-out sessions"
         found.append(Line("extended model", text, "less", "look" if worse or gain <= 0.0 else "good", "gain"))
     found += _replay_line(content)
     count = len(details.get("notes", []))
@@ -325,8 +328,14 @@ def _replay_line(content: Plain) -> list[Line]:
 
 
 def _worse(details: Plain, names: Sequence[str]) -> list[str]:
-    rows = details.get("rows", [])
-    return [f"{_name(r['joint'], names)} {r['side']}" for r in rows if r["gain_interval_95"][1] < 0.0]
+    """Rows with a larger error by more than chance, and by more than anyone would feel."""
+    felt = (
+        row
+        for row in details.get("rows", [])
+        if row["gain_interval_95"][1] < 0.0
+        and row["test_rms_extended"] > (1.0 + FELT_WORSE) * row["test_rms_base"]
+    )
+    return [f"{_name(row['joint'], names)} {row['side']}" for row in felt]
 
 
 def _experiments(details: Plain, names: Sequence[str]) -> Part:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _RECORDED_SETS = 3
 _LOUDEST = 5
+_RIGID = "taken as the links', for no stiffness of the joints is given (`--stiffness`)"
 _FIRST_SEED = 1001
 """Seed of the emulator's noise in the first set; other runs begin at 1, so no noise comes twice."""
 
@@ -62,6 +63,7 @@ def command(
     urdf: Path | None,
     coupling: tuple[str, ...],
     gear_ratio: str | None,
+    stiffness: str | None,
     yes: bool,
     allow_non_realtime: bool,
     as_json: bool,
@@ -108,7 +110,8 @@ def command(
     status.show("estimating the healthy arm")
     parts = [[read_recording(path, status=False) for path in part] for part in paths]
     chain = chain_of(parts[0], urdf)
-    found = commission(parts, chain, arm=arm_data(known_arm(arm, chain), chain, coupling, gear_ratio))
+    data = arm_data(known_arm(arm, chain), chain, coupling, gear_ratio, stiffness)
+    found = commission(parts, chain, arm=data)
     status.clear()
     found.save(out)
     if as_json:
@@ -212,7 +215,9 @@ def _ending(found: Reference, sets: int, sessions: int, names: tuple[str, ...], 
     delays = [
         (f"{side} torque", f"{1e3 * delay:.2f} ± {1e3 * found.delay_std_s[side]:.2f} ms from day to day")
         for side, delay in (("motor", found.motor_delay_s), ("joint", found.joint_delay_s))
+        if side in found.noise
     ]
+    elastic = bool((found.compliance > 0.0).any())
     loudest = sorted(found.null.items(), key=lambda item: -item[1])[:_LOUDEST]
     listed = ", ".join(
         f"{cause}{f' {names[joint]}' if joint >= 0 else ''} {gain:.0f}" for (cause, joint), gain in loudest
@@ -237,7 +242,7 @@ def _ending(found: Reference, sets: int, sessions: int, names: tuple[str, ...], 
         f"The healthy arm, from {sessions} sessions in {sets} set{'s' if sets > 1 else ''}.",
         [
             *((f"delay of the {name}", value) for name, value in delays),
-            ("positions", f"of the {found.encoder}s"),
+            ("positions", f"of the {found.encoder}s" if elastic else _RIGID),
         ],
         look,
         ["An experiment compares itself with it by `diagnosis: {reference: FILE}` in its file."],

@@ -17,7 +17,7 @@ from runner.terminal import (
 
 _GROUPS = {
     "Sessions": ("test", "model", "reference"),
-    "Arm": ("arm", "urdf", "coupling", "gear_ratio"),
+    "Arm": ("arm", "urdf", "coupling", "gear_ratio", "stiffness"),
 }
 
 
@@ -60,6 +60,7 @@ def command(
     urdf: Path | None,
     coupling: tuple[str, ...],
     gear_ratio: str | None,
+    stiffness: str | None,
     compare: tuple[tuple[str, str], ...],
     no_simulation: bool,
     jobs: int,
@@ -108,7 +109,7 @@ def command(
         chain,
         test=held,
         arm=known,
-        data=arm_data(known, chain, coupling or recorded_couplings(logs), gear_ratio),
+        data=arm_data(known, chain, coupling or recorded_couplings(logs), gear_ratio, stiffness),
         model=None if model is None else read_model(model),
         reference=None if reference is None else read_model(reference),
         simulate=not no_simulation,

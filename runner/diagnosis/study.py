@@ -277,12 +277,16 @@ def chain_of(sessions: Sequence[Session], urdf: Path | None) -> Chain:
 
 
 def arm_data(
-    arm: Arm | None, chain: Chain, coupling: Sequence[str] = (), gear_ratio: str | None = None
+    arm: Arm | None,
+    chain: Chain,
+    coupling: Sequence[str] = (),
+    gear_ratio: str | None = None,
+    stiffness: str | None = None,
 ) -> ArmData:
     """Stiffness and gear ratios of an arm file, and the options of the command line about the drives.
 
-    coupling : each `A:B`, two joints with coupled drives. gear_ratio : `N` for all joints or `N,N,...`, in place
-    of the arm file's. Raises ConfigurationError for unknown joints and wrong numbers.
+    coupling : each `A:B`, two joints with coupled drives. gear_ratio, stiffness [Nm/rad] : `N` for all joints or
+    `N,N,...`, in place of the arm file's. Raises ConfigurationError for unknown joints and wrong numbers.
     """
     pairs = couplings(coupling)
     for name in (name for pair in pairs for name in pair.joints):
@@ -290,8 +294,11 @@ def arm_data(
             raise ConfigurationError(f"--coupling: no joint {name!r}; joints: {', '.join(chain.joint_names)}")
     ratio = None if arm is None else arm.gear_ratio.astype(float)
     if gear_ratio is not None:
-        ratio = _gear_ratios(gear_ratio, chain.n)
-    return ArmData(None if arm is None else arm.stiffness, ratio, pairs)
+        ratio = _each_joint("--gear-ratio", gear_ratio, chain.n)
+    stiff = None if arm is None else arm.stiffness
+    if stiffness is not None:
+        stiff = _each_joint("--stiffness", stiffness, chain.n)
+    return ArmData(stiff, ratio, pairs)
 
 
 def asked(text: str, names: Sequence[str]) -> Place:
@@ -316,13 +323,13 @@ def asked(text: str, names: Sequence[str]) -> Place:
     return effect.cause, (int(word),)
 
 
-def _gear_ratios(text: str, n: int) -> NDArray[np.float64]:
+def _each_joint(option: str, text: str, n: int) -> NDArray[np.float64]:
     try:
         values = np.array([float(part) for part in text.split(",")])
     except ValueError:
-        raise ConfigurationError(f"--gear-ratio {text!r} is no number or list such as 100,100,160") from None
+        raise ConfigurationError(f"{option} {text!r} is no number or list such as 100,100,160") from None
     if len(values) not in (1, n) or not np.all((values > 0.0) & np.isfinite(values)):
         raise ConfigurationError(
-            f"--gear-ratio {text!r}: one number above zero for all joints, or one for each of the {n} joints"
+            f"{option} {text!r}: one number above zero for all joints, or one for each of the {n} joints"
         )
     return np.broadcast_to(values, n).copy()

@@ -97,6 +97,28 @@ def test_a_notebook_shows_ten_lines_at_most() -> None:
     assert said.brief().endswith("more lines")
 
 
+def test_an_extended_model_without_the_causes_and_rows_that_it_worsens_are_named() -> None:
+    row = {
+        "side": "motor",
+        "joint": 3,
+        "noise_floor": 0.1,
+        "test_rms_base": 0.5,
+        "test_rms_extended": 0.52,
+        "gain": -0.02,
+        "gain_interval_95": [-0.03, -0.01],
+        "avoidable": 0.0,
+        "avoidable_share": 0.0,
+    }
+    # Half a per cent is felt by nobody, however sure.
+    rows = [row, {**row, "joint": 4, "test_rms_extended": 0.5025}]
+    said = statements(CONTENT, details(rows=rows), NAMES)
+    line = next(one for one in said.lines if one.subject == "extended model")
+    assert line.found.endswith("; worse: E1 motor")
+    said = statements({**CONTENT, "extension": []}, details(rows=rows), NAMES)
+    line = next(one for one in said.lines if one.subject == "extended model")
+    assert line.found == "the base model: no cause here lasts and lessens the error of held-out sessions"
+
+
 def test_a_worse_replay_is_pointed_out() -> None:
     line = next(one for one in statements(CONTENT, details(), NAMES).lines if one.anchor == "replay")
     assert line.level == "look"
