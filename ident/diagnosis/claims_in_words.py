@@ -97,9 +97,13 @@ def finding_statement(
     evidence = finding.get("evidence") or {}
     before, after = evidence.get("test_rms_before"), evidence.get("test_rms_after")
     if before and after is not None and not (mode and counted):
-        interval = evidence.get("gain_interval_95")
-        gain = f", less by {interval[0]:.3g} to {interval[1]:.3g} Nm (95 %)" if interval else ""
-        facts.append(("error on held-out data", f"{before:.3g} -> {after:.3g} Nm{gain}"))
+        rows = [f"{joints_text([joint], names)} {side}" for side, joint in evidence.get("rows") or ()]
+        label = ", ".join(["error on held-out data", *rows]) if len(rows) == 1 else "error on held-out data"
+        low, high = evidence.get("gain_interval_95") or (math.nan, math.nan)
+        gain = f", less by {low:.3g} to {high:.3g} Nm (95 %)" if low == low else ""
+        told = f"{before:.3g} -> {after:.3g} Nm{gain}"
+        # A change between sessions shows as a change, and seldom in a further session.
+        facts.append((label, f"{told}; they do not show it" if low <= 0.0 else told))
     facts += [("could also be", placed(other, names)) for other in others]
     if finding.get("tell_apart") and others:
         facts.append(("discriminating experiment", named(str(finding["tell_apart"]), names)))

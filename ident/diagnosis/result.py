@@ -33,13 +33,15 @@ class Value:
 
 @dataclass(frozen=True)
 class Evident:
-    """Evidence of a finding. test_rms [Nm] over the affected rows; interval of their difference."""
+    """Evidence of a finding. test_rms [Nm] over `rows`, sides and joints from 1, the most affected; interval of their
+    difference."""
 
     delta_bic: float
     p_value: float
     test_rms_before: float
     test_rms_after: float
     gain_interval_95: tuple[float, float]
+    rows: tuple[tuple[str, int], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,7 @@ class Finding:
                 "test_rms_before": self.evidence.test_rms_before,
                 "test_rms_after": self.evidence.test_rms_after,
                 "gain_interval_95": list(self.evidence.gain_interval_95),
+                "rows": [list(row) for row in self.evidence.rows],
             },
             "confidence": self.confidence,
             "alternatives": [
