@@ -15,7 +15,8 @@ from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import ModelStructure, Side
 from ident.rows.data_quality import Stuck, clipped_at, passed_band, stuck_at
-from ident.rows.prepare import PreparedSession, prepare
+from ident.rows.prepare import prepare
+from ident.rows.prepared import PreparedSession
 from ident.rows.sessions import payload_name, stated_mass
 from ident.rows.signal_choice import choose_signals
 from lwr_driver.session import Session

@@ -34,7 +34,7 @@ from ident.estimators.estimate import student_tail
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import Model, as_model
 from ident.rows.filters import SignalSettings
-from ident.rows.prepare import PreparedSession, TorqueChannel
+from ident.rows.prepared import PreparedSession, TorqueChannel
 from ident.rows.sessions import payload_name
 from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions

@@ -27,7 +27,7 @@ from ident.estimation.scores import resampled
 from ident.estimation.validate import mounted, prepared_session
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
-from ident.rows.prepare import PreparedSession
+from ident.rows.prepared import PreparedSession
 from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session
 

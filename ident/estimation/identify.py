@@ -31,7 +31,7 @@ from ident.model.signals import signals_entry
 from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import stack
-from ident.rows.prepare import PreparedSession
+from ident.rows.prepared import PreparedSession
 from ident.rows.sessions import payload_name, require
 from ident.rows.shared_rows import marks
 from ident.rows.signal_choice import choose_signals

@@ -34,7 +34,8 @@ from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.estimators.problem import Problem
 from ident.rows.content import Recall
 from ident.rows.observation import observe
-from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
+from ident.rows.prepare import prepare
+from ident.rows.prepared import PreparedSession, TorqueChannel
 from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
 from lwr_driver.session.spool import stored

@@ -27,7 +27,7 @@ from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
 from ident.rows.filters import ParallelFilter, SignalSettings
-from ident.rows.prepare import Passage, PreparedSession, TorqueChannel
+from ident.rows.prepared import Passage, PreparedSession, TorqueChannel
 from ident.rows.sessions import payload_name
 from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.notebook import subplots

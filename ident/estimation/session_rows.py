@@ -14,7 +14,8 @@ from ident.rows.content import Recall
 from ident.rows.delay import SHIFT_S, Delay, delay_alone
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
-from ident.rows.prepare import PreparedSession, prepare
+from ident.rows.prepare import prepare
+from ident.rows.prepared import PreparedSession
 from ident.screening.screen import without_dead
 from lwr_driver.session import Session
 

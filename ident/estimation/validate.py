@@ -24,7 +24,8 @@ from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import Model, as_model
 from ident.model.signals import signal_settings
 from ident.rows.filters import SignalSettings
-from ident.rows.prepare import PreparedSession, TorqueChannel, prepare
+from ident.rows.prepare import prepare
+from ident.rows.prepared import PreparedSession, TorqueChannel
 from ident.rows.sessions import payload_name
 from ident.rows.shared_rows import from_marks, seen_before
 from ident.screening.doubts import Doubt, settle

@@ -18,7 +18,7 @@ import numpy as np
 from fri.errors import ConfigurationError
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
-from ident.rows.prepare import PreparedSession
+from ident.rows.prepared import PreparedSession
 
 SIGNALS = "signals"
 

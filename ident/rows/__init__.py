@@ -12,7 +12,8 @@ from ident.rows.filters import (
     low_pass,
 )
 from ident.rows.observation import commanded, observe, stack
-from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, prepare
+from ident.rows.prepare import prepare
+from ident.rows.prepared import Passage, PreparedSession, TorqueChannel
 from ident.rows.sessions import payload_name, require, stated_mass
 from ident.rows.signal_choice import SignalChoice, choose_signals
 from lwr_driver.session import Sessions, as_sessions

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Coulomb, DriveMotion, ModelStructure, Side
-from ident.rows.prepare import PreparedSession, TorqueChannel
+from ident.rows.prepared import PreparedSession, TorqueChannel
 
 _CHUNK = 500
 

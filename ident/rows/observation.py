@@ -35,7 +35,8 @@ from ident.rows.filters import (
     settling,
     thinning,
 )
-from ident.rows.prepare import Passage, PreparedSession, TorqueChannel, clock_ns
+from ident.rows.prepare import clock_ns
+from ident.rows.prepared import Passage, PreparedSession, TorqueChannel
 from ident.rows.timebase import Stretch, sample_period, stretches
 from lwr_driver.session import Session
 from lwr_driver.session.spool import Growing, release

@@ -28,7 +28,8 @@ from ident.dynamics.regressor import rigid_regressor
 from ident.dynamics.structure import Coupling
 from ident.rows.content import Recall
 from ident.rows.filters import ParallelFilter, SignalSettings, block_means, thinning
-from ident.rows.prepare import TorqueChannel, prepare
+from ident.rows.prepare import prepare
+from ident.rows.prepared import TorqueChannel
 from ident.rows.sessions import payload_name
 from lwr_driver.session import Session
 

@@ -21,7 +21,7 @@ from ident.model import DynamicModel
 from ident.model.model_file import read_model
 from ident.model.signals import signal_settings
 from ident.rows.filters import ParallelFilter, SignalSettings
-from ident.rows.prepare import Passage, PreparedSession
+from ident.rows.prepared import Passage, PreparedSession
 from lwr_driver.session import Session, read_session
 from runner.published import is_published_arm
 

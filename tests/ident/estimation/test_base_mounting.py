@@ -14,7 +14,8 @@ from ident.estimation.mounting import find_mounting, tilt_columns
 from ident.estimators import nearest_consistent
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import observe
-from ident.rows.prepare import TorqueChannel, prepare
+from ident.rows.prepare import prepare
+from ident.rows.prepared import TorqueChannel
 from lwr_driver.configuration import find
 from lwr_driver.session import JointColumns, Session
 from tests.ident import estimation_arm

@@ -10,7 +10,8 @@ import pytest
 from ident.dynamics.structure import Coulomb, ModelStructure
 from ident.rows.binned import binned_regressor, bins, observe_bins
 from ident.rows.filters import SignalSettings
-from ident.rows.prepare import PreparedSession, prepare
+from ident.rows.prepare import prepare
+from ident.rows.prepared import PreparedSession
 from tests.ident import estimation_arm as arm
 
 STRUCTURE = ModelStructure(arm.chain())

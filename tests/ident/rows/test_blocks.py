@@ -16,13 +16,13 @@ from ident.rows import SignalSettings, commanded, observe, prepare
 from lwr_driver.session import spool
 from tests.ident import estimation_arm as arm
 
-prepare_module = importlib.import_module("ident.rows.prepare")
+motion_module = importlib.import_module("ident.rows.filtered_motion")
 
 
 @pytest.fixture
 def long(monkeypatch):
     """A session with lost samples and an outlier, cut into several blocks kept in files."""
-    monkeypatch.setattr(prepare_module, "_BLOCK_S", 6.0)
+    monkeypatch.setattr(motion_module, "_BLOCK_S", 6.0)
     monkeypatch.setattr(spool, "LEAST_BYTES", 1)
     session = arm.session(seed=4, periods=5, period_s=10.0, command=True)
     keep = np.ones(len(session.joint), dtype=bool)
@@ -54,7 +54,7 @@ def test_blocks_give_the_rows_of_the_whole_session(long, stiffness):
 
 
 def test_a_block_has_the_samples_in_reach_of_its_filters_and_no_more(monkeypatch):
-    monkeypatch.setattr(prepare_module, "_BLOCK_S", 10.0)
+    monkeypatch.setattr(motion_module, "_BLOCK_S", 10.0)
     count = {}
     for periods in (8, 12):
         session = arm.session(seed=4, periods=periods, period_s=10.0, motor=False)

@@ -14,18 +14,10 @@ from ident.rows.binned import _add_means, bins
 from ident.rows.class_rows import ClassRows
 from ident.rows.content import Recall
 from ident.rows.delay import Delay, DelayData, estimate_delay
+from ident.rows.filtered_motion import _cut
 from ident.rows.filters import SignalSettings, half_width, low_pass, settling
-from ident.rows.prepare import (
-    Passage,
-    TorqueChannel,
-    _cut,
-    _mean_torque,
-    _row_grid,
-    _valid,
-    _windows,
-    clock_ns,
-    prepare,
-)
+from ident.rows.prepare import _mean_torque, _row_grid, _valid, _windows, clock_ns, prepare
+from ident.rows.prepared import Passage, TorqueChannel
 from ident.rows.signal_choice import _Bench, _excerpt, _reversal_s, _with_decimation
 from ident.rows.timebase import stretches
 from lwr_driver.session import Phase

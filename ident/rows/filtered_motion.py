@@ -1,0 +1,294 @@
+"""Filtered motion of the stretches of a session, whole or block after block, and the torque channels on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.dynamics.parameters import Floats
+from ident.dynamics.structure import DriveMotion
+from ident.rows.content import Recall
+from ident.rows.delay import DELAY_DB, DELAY_HZ
+from ident.rows.filters import (
+    Excitation,
+    SignalSettings,
+    differentiate,
+    enough,
+    half_width,
+    interpolate_uniform,
+    low_pass,
+    median_step,
+    settling,
+    thinning,
+)
+from ident.rows.prepared import BoolArray, TorqueChannel
+from ident.rows.reversals import away_from_reversals, turning_reach
+from ident.rows.timebase import Stretch
+from lwr_driver.session.spool import LEAST_BYTES, release, shelved
+
+# Longest block [s].
+_BLOCK_S = 120.0
+# Latest filtered motions of stretches: two sessions at two cut-offs.
+_MOST_MOTIONS = 4
+
+
+@dataclass(frozen=True)
+class WideMotion:
+    """Filtered motion of the samples of a stretch from number `low` on, and their joint torque.
+
+    q, qd, qdd, torque, flagged : (n, J). drive : as in `TorqueChannel`.
+    """
+
+    low: int
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    torque: Floats
+    flagged: BoolArray
+    drive: DriveMotion | None
+
+    @classmethod
+    def of(
+        cls,
+        part: Stretch,
+        low: int,
+        high: int,
+        effort_flags: BoolArray,
+        times: Floats,
+        settings: SignalSettings,
+        stiffness: Floats | None,
+    ) -> WideMotion:
+        """The samples from `low` to before `high`."""
+        joints = effort_flags.shape[1]
+        values = part.part(low, high)
+        release(*part.columns)
+        q = low_pass(values[:, :joints], part.dt, settings.cutoff, settings.order)
+        qd, qdd = differentiate(q, part.dt)
+        torque = values[:, joints:].copy()
+        flagged = np.repeat(part.bridged[low:high, None], joints, axis=1)
+        grid = part.start + part.dt * np.arange(low, high, dtype=np.float64)
+        for joint in np.flatnonzero(effort_flags.any(axis=0)):
+            hit = np.rint((times[effort_flags[:, joint]] - part.start) / part.dt).astype(np.int64) - low
+            spread = np.unique(np.concatenate([hit - 1, hit, hit + 1])) if part.resampled else np.unique(hit)
+            flagged[spread[(spread >= 0) & (spread < len(grid))], joint] = True
+            good = ~flagged[:, joint]
+            torque[~good, joint] = np.interp(grid[~good], grid[good], torque[good, joint])
+        drive = None
+        if stiffness is not None:
+            twist = low_pass(torque / stiffness, part.dt, settings.cutoff, settings.order)
+            rate, change = differentiate(twist, part.dt)
+            drive = DriveMotion(qd + rate, qdd + change)
+        return cls(low, q, qd, qdd, torque, flagged, drive)
+
+
+def recalled(
+    effort_flags: BoolArray,
+    times: Floats,
+    settings: SignalSettings,
+    stiffness: Floats | None,
+    recall: Recall,
+    same: tuple[Any, ...],
+    part: Stretch,
+    low: int,
+    high: int,
+) -> WideMotion:
+    """`WideMotion.of`, recalled for a short stretch. same : what the motion of a session depends on."""
+    make = partial(WideMotion.of, part, low, high, effort_flags, times, settings, stiffness)
+    if high - low < part.count or 8 * effort_flags.shape[1] * part.count >= LEAST_BYTES:
+        return make()
+    return recall.of(make, *same, settings.stiffness_nm_rad, part.start, most=_MOST_MOTIONS)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Filtered motion of a block of one stretch and its joint torque.
+
+    start, end : times of the whole stretch's first and last sample [s]. low : number of the first sample here. core :
+    times of the block [s].
+    """
+
+    start: float
+    end: float
+    dt: float
+    low: int
+    core: tuple[float, float]
+    q: Floats
+    qd: Floats
+    qdd: Floats
+    torque: Floats
+    flagged: BoolArray
+    away: BoolArray
+    drive: DriveMotion | None
+
+    @classmethod
+    def of(
+        cls,
+        part: Stretch,
+        span: tuple[int, int],
+        core: tuple[float, float],
+        wide: WideMotion,
+        settings: SignalSettings,
+    ) -> Motion:
+        """The samples from span[0] to before span[1] of `wide`."""
+        beside = settings.reversal, settings.standstill_rad_s, settings.turning
+        away = away_from_reversals(wide.qd, part.dt, *beside)
+        away &= np.abs(wide.qd) > settings.slow
+        kept = slice(span[0] - wide.low, span[1] - wide.low)
+        states = wide.q[kept], wide.qd[kept], wide.qdd[kept], wide.torque[kept]
+        drive = None if wide.drive is None else wide.drive.at(kept)
+        return cls(
+            part.start, part.end, part.dt, span[0], core, *states, wide.flagged[kept], away[kept], drive
+        )
+
+    @property
+    def arrays(self) -> tuple[Floats | BoolArray, ...]:
+        """All arrays by sample."""
+        drive = () if self.drive is None else (self.drive.speed, self.drive.acceleration)
+        return (self.q, self.qd, self.qdd, self.torque, self.flagged, self.away, *drive)
+
+    def on(self, arrays: Sequence[NDArray[Any]]) -> Motion:
+        """The same with other arrays."""
+        names = ("q", "qd", "qdd", "torque", "flagged", "away")
+        drive = None if self.drive is None else DriveMotion(arrays[6], arrays[7])
+        found: dict[str, Any] = dict(zip(names, arrays, strict=False))
+        return replace(self, **found, drive=drive)
+
+    @property
+    def first(self) -> float:
+        """Time of the first sample here [s]."""
+        return self.start + self.dt * self.low
+
+    @property
+    def times(self) -> Floats:
+        """Sample times (n,) [s]."""
+        return self.start + self.dt * np.arange(self.low, self.low + len(self.q), dtype=np.float64)
+
+    @property
+    def of_motors(self) -> tuple[Floats, Floats]:
+        """Speed and acceleration (n, J) of the motors."""
+        return (self.qd, self.qdd) if self.drive is None else (self.drive.speed, self.drive.acceleration)
+
+    def usable(self, settings: SignalSettings) -> tuple[float, float]:
+        """First and last time of the stretch unaffected by the filter's start and end [s]."""
+        return self.start + settings.edge, self.end - settings.edge
+
+    def channel(self, settings: SignalSettings) -> TorqueChannel:
+        """The joint torque channel, without the filter's ends."""
+        cut, count = int(np.ceil(settings.edge / self.dt)), round((self.end - self.start) / self.dt) + 1
+        part = slice(max(cut - self.low, 0), max(min(count - cut - self.low, len(self.q)), 0))
+        flagged = self.flagged[part]
+        return TorqueChannel(
+            "joint", self.times[part], self.q[part], self.qd[part], self.qdd[part], self.torque[part],
+            flagged, self.away[part] & ~flagged, period_s=self.dt,
+        )  # fmt: skip
+
+    def motor_channel(
+        self, times: Floats, torque: Floats, flags: BoolArray, delay: float, settings: SignalSettings
+    ) -> TorqueChannel | None:
+        """The motor torque with the motion at its own times minus the delay.
+
+        Lost positions are bridged, at this bandwidth as good as measured ones.
+        """
+        first, last = self.usable(settings)
+        actual = times - delay
+        low, high = int(np.searchsorted(actual, first)), int(np.searchsorted(actual, last, side="right"))
+        if high - low < 16:
+            return None
+        period = median_step(actual[low:high])
+        # Samples averaged before a low-pass are the same in all blocks.
+        together = thinning(period, settings.decimate)
+        if not enough(high - low, period, settings.decimate):
+            return None
+        if self.core[0] > -np.inf:
+            since = int(np.searchsorted(actual, self.first)) - low
+            low += max(-(-since // together), 0) * together
+        if self.core[1] < np.inf:
+            until = int(np.searchsorted(actual, self.first + self.dt * (len(self.q) - 1), side="right"))
+            high = min(high, until)
+        inside = slice(low, high)
+        actual, flagged = actual[inside], flags[inside]
+        start, dt = self.first, self.dt
+        q, qd, qdd = (interpolate_uniform(state, start, dt, actual) for state in (self.q, self.qd, self.qdd))
+        at = np.clip(np.rint((actual - start) / dt).astype(np.int64), 0, len(self.q) - 1)
+        drive = None
+        if self.drive is not None:
+            moved = (self.drive.speed, self.drive.acceleration)
+            drive = DriveMotion(*(interpolate_uniform(state, start, dt, actual) for state in moved))
+        known = self.away[at] & ~flagged
+        return TorqueChannel(
+            "motor", actual, q, qd, qdd, torque[inside], flagged, known, drive, period_s=period
+        )
+
+
+def filtered_motions(
+    parts: list[Stretch],
+    wide: Callable[[Stretch, int, int], WideMotion],
+    settings: SignalSettings,
+    blocks: bool,
+) -> Iterator[Motion]:
+    """The motions of all stretches, block after block. wide : the samples of a stretch between two numbers."""
+    seen = turning_reach(settings.reversal, settings.standstill_rad_s, settings.turning)
+    for part in parts:
+        around = int(np.ceil((settling(settings.cutoff, settings.order) + seen) / part.dt)) + 16
+        for span, core in _cut(part, settings, blocks):
+            low, high = max(span[0] - around, 0), min(span[1] + around, part.count)
+            yield Motion.of(part, span, core, wide(part, low, high), settings)
+
+
+def excitation_hz(motions: Sequence[Motion], part: Stretch, dt: float) -> float:
+    """Upper frequency of the motion of a stretch [Hz]."""
+    spectrum = Excitation(part.count, dt)
+    for motion in motions:
+        if motion.start == part.start:
+            mine = (motion.times >= motion.core[0]) & (motion.times < motion.core[1])
+            spectrum.add(motion.qd[mine])
+            release(*motion.arrays)
+    return spectrum.frequency()
+
+
+def _cut(
+    part: Stretch, settings: SignalSettings, blocks: bool
+) -> Iterator[tuple[tuple[int, int], tuple[float, float]]]:
+    """Samples of each block of a stretch, with those in reach of its filters, and its core [s]."""
+    together = thinning(part.dt, settings.decimate)
+    size = max(1, round(_BLOCK_S / part.dt / together)) * together
+    cut = int(np.ceil(settings.edge / part.dt))
+    count = (part.count - 2 * cut) // size
+    if not blocks or count < 2:
+        yield (0, part.count), (-np.inf, np.inf)
+        return
+    delay_hz = min(DELAY_HZ, settings.cutoff)
+    reach_s = max(
+        half_width(settings.decimate, settings.attenuation_db) + settling(2.5 * settings.decimate),
+        half_width(delay_hz, DELAY_DB) + settings.delay_search_s + settling(3.0 * delay_hz),
+    )
+    reach = -(-round((reach_s + 0.5) / part.dt) // together) * together
+    for k in range(count):
+        first, last = cut + k * size, cut + (k + 1) * size
+        low = first - reach if k and first - reach > cut else 0
+        high = last + reach if k < count - 1 and last + reach < part.count - cut else part.count
+        # A core ends between two samples.
+        ends = (part.start + part.dt * (sample - 0.5) for sample in (first, last))
+        begin, end = (
+            edge if inner else limit
+            for edge, inner, limit in zip(ends, (k > 0, k < count - 1), (-np.inf, np.inf), strict=True)
+        )
+        yield (low, high), (begin, end)
+
+
+def motions_shelved(motions: Iterable[Motion]) -> list[Motion]:
+    """The same motions with their arrays in files where they are long."""
+    bare: list[Motion] = []
+
+    def arrays() -> Iterator[tuple[NDArray[Any], ...]]:
+        for motion in motions:
+            bare.append(motion.on([array[:0].copy() for array in motion.arrays]))
+            yield motion.arrays
+
+    found = shelved(arrays())
+    return [motion.on(arrays) for motion, arrays in zip(bare, found, strict=True)]
