@@ -26,7 +26,7 @@ from ident.diagnosis.findings import loss_finding
 from ident.diagnosis.held_out import HeldOut, held_out
 from ident.diagnosis.nominal import GAIN_STD, TRAVEL_RAD, Nominal
 from ident.diagnosis.probes import Remainder, find_remainders
-from ident.diagnosis.reference import Reference, announced_masses
+from ident.diagnosis.reference import Reference
 from ident.diagnosis.refit import left_by, refitted
 from ident.diagnosis.result import Diagnosis, Finding, Nameless, RowStates, Unexplained
 from ident.diagnosis.task import Baseline, State, Task
@@ -37,9 +37,6 @@ from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.data_quality import sample_loss
 
-# Least difference of a payload's mass from the announced one, as a share of it, and the causes that tell it.
-_OTHER_MASS = 0.1
-_LOADS = ("payload_error", "payload_change")
 # Least error of a sensor's gain in the models, in its standard deviations and in those from day to day.
 _CLEAR, _MATTERS = 2.0, 0.5
 
@@ -88,7 +85,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
     findings = [contradicted(f) if any(f is r for r in refuted) else f for f in findings]
     doubts += [f for f in findings if not believable(f.grounds)]
     findings = [f for f in findings if believable(f.grounds)]
-    findings += [*state.timing, *worn]
+    findings += [*state.timing, *state.loads, *worn]
     loss = sample_loss(list(task.sessions))
     if loss:
         findings.append(loss_finding(loss[0]))
@@ -152,12 +149,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         nuisance=state.selection.nuisance,
         simulation_base=simulation,
         simulation_extended=extended_simulation,
-        notes=(
-            *_notes(bench, task.reference),
-            *_payload_notes(bench, findings),
-            *_channel_notes(nominal, remainders),
-            *notes,
-        ),
+        notes=(*_notes(bench, task.reference), *_channel_notes(nominal, remainders), *notes),
         residuals={"base": before.residual, "extended": after.residual},
         states={side: _states(nominal, side, before.block[side]) for side in nominal.rows},
     )
@@ -285,30 +277,6 @@ def _channel_notes(nominal: Nominal, remainders: Sequence[Remainder]) -> list[st
         for one in r.stuck
     ]
     return lines + stuck
-
-
-def _payload_notes(bench: DiagnosisBench, findings: Sequence[Finding]) -> list[str]:
-    """Payloads of another mass than the announced one by these sessions alone, where no finding says so.
-
-    A reference that ties the payload to its mass leaves a wrong one to the gains of the sensors.
-    """
-    evidence, base = bench.evidence, bench.nominal.base
-    announced = announced_masses(base, bench.nominal.masses)
-    if not announced or any(f.cause in _LOADS for f in findings):
-        return []
-    kept = list(evidence.extra)
-    evidence.replace([])
-    values, covariance = evidence.free()
-    evidence.replace(kept)
-    found = []
-    for k, (payload, stated) in announced.items():
-        mass, std = float(values[k]), float(np.sqrt(max(covariance[k, k], 0.0)))
-        if abs(mass - stated) > max(_OTHER_MASS * stated, 3.0 * std):
-            found.append(
-                f"payload {payload!r}: {mass:.3f} ± {std:.3f} kg by these sessions alone, {stated:.3f} kg announced; "
-                "check the mounted payload first, a wrong one leads to false causes"
-            )
-    return found
 
 
 def _notes(bench: DiagnosisBench, reference: Reference | None) -> list[str]:

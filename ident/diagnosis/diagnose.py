@@ -29,6 +29,7 @@ from ident.diagnosis.conclusion import conclude
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import confirmed_delay
 from ident.diagnosis.evidence import Score
+from ident.diagnosis.payloads import other_masses, payload_finding, with_masses
 from ident.diagnosis.recording import record, settled, usual_step
 from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
 from ident.diagnosis.result import Diagnosis, Finding
@@ -101,7 +102,18 @@ def diagnose(
         )
         if worthless(broken):
             return _ended(task, broken)
-        found = conclude(task, _refined(task, _in_time(task, _first(task))))
+        first = _first(task)
+        others = other_masses(first.bench, reference)
+        if others and reference is not None:
+            # With a mass of its own it pulls at nothing else.
+            task = with_masses(task, {one.payload: one.mass for one in others})
+            first = _first(task)
+        state = _refined(task, _in_time(task, first))
+        if reference is not None:
+            state = replace(state, loads=tuple(map(payload_finding, others)))
+        else:
+            state = replace(state, notes=(*state.notes, *(one.text for one in others)))
+        found = conclude(task, state)
         nameless = tuple(u for u in found.unexplained if not is_broken(broken, u.side, u.joint))
         return replace(found, unexplained=nameless, data=broken)
 

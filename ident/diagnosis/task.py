@@ -88,13 +88,14 @@ class Baseline:
 class State:
     """A diagnosis in progress.
 
-    timing : findings of late channels, already shifted on the bench. baseline : before the shift. left_out : causes
-    dropped from the candidates.
+    timing : findings of late channels, already shifted on the bench. loads : of payloads of another mass.
+    baseline : before the shift. left_out : causes dropped from the candidates.
     """
 
     bench: DiagnosisBench
     selection: Selection
     timing: tuple[Finding, ...] = ()
+    loads: tuple[Finding, ...] = ()
     baseline: Baseline | None = None
     notes: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()

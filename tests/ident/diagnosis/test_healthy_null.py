@@ -10,10 +10,9 @@ import pytest
 
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.commission import compliance_std, delay_std, gain_std, with_far_presliding
-from ident.diagnosis.conclusion import _payload_notes
 from ident.diagnosis.evidence import Score
 from ident.diagnosis.nominal import GAIN_STD, NominalArm
-from ident.diagnosis.reference import DELAY_STD_S, Reference, announced_masses
+from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.diagnosis.selection import State
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.usual_sizes import Healthy
@@ -228,30 +227,6 @@ def test_a_limit_grows_with_the_information_of_the_motion_and_falls_with_none() 
         healthy = Healthy({("stribeck", 0): 50.0}, {("stribeck", 0): {"v": 10.0}})
         state = State(dictionary, None, DiagnosisSettings(), healthy)  # type: ignore[arg-type]
         assert state.usual(trial) == pytest.approx(limit)
-
-
-def test_a_payload_of_another_mass_than_announced_is_told_where_no_finding_tells_it(chain: Chain) -> None:
-    structure = ModelStructure(chain, 1, ("weight",))
-    base = numeric_base(structure, (Condition(None, ("joint",)), Condition("weight", ("joint",))))
-    place = next(iter(announced_masses(base, {"weight": 2.0})))
-
-    def notes(mass: float, std: float, *causes: str) -> list[str]:
-        values, covariance = np.zeros(len(base)), np.zeros((len(base),) * 2)
-        values[place], covariance[place, place] = mass, std**2
-        evidence = SimpleNamespace(extra=["kept"], free=lambda: (values, covariance))
-        evidence.replace = lambda extra: setattr(evidence, "extra", list(extra))
-        bench = SimpleNamespace(
-            evidence=evidence, nominal=SimpleNamespace(base=base, masses={"weight": 2.0, "other": None})
-        )
-        found = _payload_notes(bench, [SimpleNamespace(cause=cause) for cause in causes])  # type: ignore[arg-type, misc]
-        assert evidence.extra == ["kept"]
-        return found
-
-    (said,) = notes(2.6, 0.01, "sensor_gain")
-    assert "payload 'weight': 2.600 ± 0.010 kg by these sessions alone, 2.000 kg announced" in said
-    assert not notes(2.6, 0.01, "payload_error")
-    assert not notes(2.6, 0.3)
-    assert not notes(2.15, 0.01)
 
 
 def _score(gain: float, count: int = 1) -> Score:

@@ -1,0 +1,118 @@
+"""Payloads that are not the announced ones, from the base parameters of a first fit.
+
+A payload of the healthy arm is tied to its mass. A much heavier or lighter one, under the same label, would pull at
+every other parameter and leave its torque to the gains of the sensors. So it is looked for first, by these sessions
+alone, told as a finding, and then has a mass of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident.diagnosis.bench import DiagnosisBench
+from ident.diagnosis.confidence import LIMITS, Grounds, probability
+from ident.diagnosis.reference import Reference, announced_masses, shared
+from ident.diagnosis.result import Evident, Finding, Value
+from ident.diagnosis.task import Task
+from ident.effects import EFFECTS
+from ident.estimators.estimate import fisher_tail
+
+# Least difference of a mass as a share of the expected one, and the largest probability of such a one by chance.
+_OTHER, _ONE_IN = 0.05, 1e-3
+# Standard deviation of a mass without a healthy one, as a share of it: the gains of the sensors act on it.
+_WEIGHED = 0.02
+_PAYLOAD = EFFECTS["payload_error"]
+
+
+@dataclass(frozen=True)
+class OtherMass:
+    """A payload whose mass by these sessions alone is not the expected one [kg]. std : of the difference."""
+
+    payload: str
+    mass: float
+    expected: float
+    std: float
+
+    @property
+    def text(self) -> str:
+        """For a note."""
+        return (
+            f"payload {self.payload!r}: {self.mass:.3f} ± {self.std:.3f} kg by these sessions alone, "
+            f"{self.expected:.3f} kg expected; check the mounted payload first, a wrong one leads to false causes"
+        )
+
+
+def other_masses(bench: DiagnosisBench, reference: Reference | None) -> list[OtherMass]:
+    """The payloads of another mass than the healthy arm's, or than the announced one."""
+    evidence, base = bench.evidence, bench.nominal.base
+    announced = announced_masses(base, bench.nominal.masses)
+    if not announced:
+        return []
+    kept = list(evidence.extra)
+    evidence.replace([])
+    values, covariance = evidence.free()
+    evidence.replace(kept)
+    healthy = {} if reference is None else _healthy(bench, reference)
+    freedom = bench.nominal.arm.chain.n * max(1 if reference is None else reference.sets, 1)
+    found = []
+    for k, (payload, stated) in announced.items():
+        expected, usual = healthy.get(k, (stated, (_WEIGHED * stated) ** 2))
+        std = float(np.sqrt(max(covariance[k, k], 0.0) + usual))
+        one = OtherMass(payload, float(values[k]), expected, std)
+        away = one.mass - expected
+        p_value = fisher_tail((away / max(std, 1e-12)) ** 2, 1, freedom)
+        if abs(away) > _OTHER * expected and p_value < _ONE_IN:
+            found.append(one)
+    return found
+
+
+def _healthy(bench: DiagnosisBench, reference: Reference) -> dict[int, tuple[float, float]]:
+    """Value and variance on the healthy arm of the base parameters shared with it, by place."""
+    own = reference.model
+    if own.base is None or own.covariance is None:
+        return {}
+    place = {int(p): k for k, p in enumerate(own.positions)}
+    pairs = shared(own.base, bench.nominal.base, reference.masses, bench.nominal.masses)
+    return {
+        b: (float(own.values[place[a]]), float(own.covariance[place[a], place[a]]))
+        for a, b in pairs
+        if a in place
+    }
+
+
+def payload_finding(one: OtherMass) -> Finding:
+    """The finding of a payload of another mass."""
+    square = ((one.mass - one.expected) / one.std) ** 2
+    grounds = Grounds(
+        gain=float(np.log(square)),
+        significance=LIMITS["significance"][1],
+        rivals=LIMITS["rivals"][1],
+        held_out=0.0,
+        untested=1.0,
+        felt=0.0,
+        one_block=0.0,
+        worse=0.0,
+    )
+    return Finding(
+        _PAYLOAD.cause,
+        _PAYLOAD.side,
+        (),
+        {"mass": Value(one.mass - one.expected, one.std, "kg")},
+        Evident(-square, 1e-12, 0.0, 0.0, (0.0, 0.0)),
+        probability(grounds),
+        (),
+        _PAYLOAD.tell_apart,
+        square,
+        grounds=grounds.to_dict(),
+    )
+
+
+def with_masses(task: Task, found: Mapping[str, float]) -> Task:
+    """The task with other masses [kg] of payloads, by name: none of their parameters is the healthy arm's."""
+    recordings = tuple(
+        replace(one, payload_mass=found.get(one.payload or "", one.payload_mass)) for one in task.recordings
+    )
+    return replace(task, recordings=recordings)

@@ -1,0 +1,80 @@
+"""A payload of another mass is told by the base parameters before anything else."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ident.diagnosis.payloads import OtherMass, other_masses, payload_finding, with_masses
+from ident.diagnosis.reference import Reference, announced_masses
+from ident.diagnosis.task import Task
+from ident.dynamics.base_set import BaseSet, numeric_base
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Condition, ModelStructure
+from ident.model import DynamicModel
+
+MASSES = {"weight": 2.0, "other": None}
+
+
+@pytest.fixture(scope="module")
+def base(chain: Chain) -> BaseSet:
+    structure = ModelStructure(chain, 1, ("weight",))
+    return numeric_base(structure, (Condition(None, ("joint",)), Condition("weight", ("joint",))))
+
+
+def bench(base: BaseSet, mass: float, std: float) -> Any:
+    place = next(iter(announced_masses(base, MASSES)))
+    values, covariance = np.zeros(len(base)), np.zeros((len(base),) * 2)
+    values[place], covariance[place, place] = mass, std**2
+    evidence = SimpleNamespace(extra=["kept"], free=lambda: (values, covariance))
+    evidence.replace = lambda extra: setattr(evidence, "extra", list(extra))
+    nominal = SimpleNamespace(base=base, masses=MASSES, arm=SimpleNamespace(chain=base.structure.chain))
+    return SimpleNamespace(evidence=evidence, nominal=nominal)
+
+
+def healthy(base: BaseSet, mass: float, std: float) -> Reference:
+    place = next(iter(announced_masses(base, MASSES)))
+    values, covariance = np.zeros(len(base)), 1e-6 * np.eye(len(base))
+    values[place], covariance[place, place] = mass, std**2
+    model = DynamicModel("arm", base.structure, base.names, values, covariance, base)
+    return Reference(model, np.zeros(3), 0.0, 0.0, {}, {}, 2, habits=True, masses=MASSES)
+
+
+def test_a_mass_is_held_against_the_healthy_one_or_the_announced_one(base: BaseSet) -> None:
+    said = bench(base, 2.6, 0.01)
+    (one,) = other_masses(said, None)
+    assert (one.payload, one.mass, one.expected) == ("weight", 2.6, 2.0)
+    assert "2.600 ± 0.041 kg by these sessions alone, 2.000 kg expected" in one.text
+    assert said.evidence.extra == ["kept"]
+    # The healthy arm weighed 2.6 kg under this label, too.
+    assert not other_masses(said, healthy(base, 2.6, 0.02))
+    (changed,) = other_masses(said, healthy(base, 2.2, 0.02))
+    assert changed.expected == pytest.approx(2.2)
+
+
+@pytest.mark.parametrize(("mass", "std"), [(2.6, 0.3), (2.08, 0.01), (2.0, 0.01)])
+def test_an_uncertain_or_small_difference_is_none(base: BaseSet, mass: float, std: float) -> None:
+    assert not other_masses(bench(base, mass, std), None)
+
+
+def test_the_finding_says_the_mass_and_is_surer_for_a_clearer_one() -> None:
+    clear, faint = (payload_finding(OtherMass("weight", 2.0 + more, 2.0, 0.04)) for more in (0.8, 0.2))
+    assert clear.cause == "payload_error"
+    assert clear.parameters["mass"].value == pytest.approx(0.8)
+    assert clear.confidence > faint.confidence > 0.5
+
+
+def test_a_payload_gets_its_own_mass_in_its_recordings_alone() -> None:
+    from dataclasses import dataclass
+
+    @dataclass(frozen=True)
+    class Recording:
+        payload: str | None
+        payload_mass: float | None
+
+    task = Task((), (), None, (Recording("weight", 2.0), Recording(None, None)), None, None, None, None, None)  # type: ignore[arg-type]
+    changed = with_masses(task, {"weight": 2.6})
+    assert [one.payload_mass for one in changed.recordings] == [2.6, None]
