@@ -119,6 +119,11 @@ def finding_statement(
     )
 
 
+def _noises(times: float) -> str:
+    """A size in units of the noise."""
+    return f"{times:.2g} times" if times >= 0.01 else "less than 0.01 times"
+
+
 def comparison(entry: Plain, names: Sequence[str], place: int = 0) -> Comparison:
     """Two causes side by side, from the plain content of a `LookAlikes`."""
     first, second = (
@@ -134,9 +139,9 @@ def comparison(entry: Plain, names: Sequence[str], place: int = 0) -> Comparison
     else:
         verdict = "these sessions do"
     overlap = (
-        f"overlap {entry['overlap']:.3f}: beside a refitted base model, {first} would leave "
-        f"{entry['strength'][0]:.2g} times the noise, and {second} could imitate all of it but {entry['apart']:.2g}. "
-        f"Telling them apart takes {entry['needed']:.2g}: {verdict}"
+        f"overlap {entry['overlap']:.3f}: beside a refitted base model, {first} leaves "
+        f"{_noises(entry['strength'][0])} the noise; {_noises(entry['apart'])} of it {second} cannot leave as well. "
+        f"Telling them apart takes {entry['needed']:.2g} times: {verdict}"
     )
     decides, seen = "", entry.get("foreseen")
     if not entry["told_apart"] or entry["shape_alone"]:
