@@ -7,7 +7,7 @@ no measure of changes. So a candidate is also held against its mean size, by the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -91,7 +91,16 @@ class Healthy:
 
 def scores(dictionary: Dictionary) -> Table:
     """Scores of all candidates with a size of their own, beside the present columns of the evidence."""
-    return {candidate.key: dictionary.scores(candidate) for candidate in dictionary.candidates}
+    return {
+        candidate.key: {shape: _settled(score) for shape, score in dictionary.scores(candidate).items()}
+        for candidate in dictionary.candidates
+    }
+
+
+def _settled(score: Score) -> Score:
+    """The score with its covariance, without the products that it is made of."""
+    covariance, blocks = score.robust()
+    return replace(score, robust=lambda: (covariance, blocks))
 
 
 def usual_sizes(sets: Sequence[Table]) -> dict[Key, UsualSize]:
