@@ -157,8 +157,11 @@ def _plain(
 ) -> bool:
     """Whether held-out rows show a claim plainly: a fall of the error by `_FELT` in the rows of its joints, in two
     blocks at least, with no other row worse beyond chance. Of changes between sessions and causes seen in the samples
-    they need not. A brief event has to be felt in the rows of its own session.
+    they need not. A brief event has to be felt in the rows of its own session. A gain that healthy sets reached is no
+    plain one.
     """
+    if claim.changed_alone:
+        return False
     if claim.trial.candidate.effect.repeats:
         return _power(claim, bench) > FELT_POWER
     if _untested(claim, finding):

@@ -57,7 +57,8 @@ _INFORMATION = (1.0, 25.0)
 class Claim:
     """An accepted trial: its score beside all other claims, and the candidates of similar gain.
 
-    outdone : a rival without enough evidence of its own has a larger gain in the same rows.
+    outdone : a rival without enough evidence of its own has a larger gain in the same rows. changed_alone : healthy
+    sets reached its gain, and it is more than there by its difference from the usual size alone.
     """
 
     trial: Trial
@@ -65,6 +66,7 @@ class Claim:
     alternatives: tuple[tuple[Candidate, float], ...] = ()
     confidence: float = 1.0
     outdone: bool = False
+    changed_alone: bool = False
 
     @property
     def gain(self) -> float:
@@ -525,7 +527,8 @@ class State:
         # Of many times tried, one always fits to some degree.
         lasting = (t for t in close if not t.candidate.effect.event)
         outdone = any(_gain(t) > _gain(again) and not self.carried(t) for t in lasting)
-        return Claim(again, again.score, alike, sure, outdone)
+        changed_alone = again.score.gain <= self.usual(again)
+        return Claim(again, again.score, alike, sure, outdone, changed_alone)
 
     def same_torque(self, candidate: Candidate) -> Candidate | None:
         """The candidate of the same torque in these sessions, by the physics of the effect."""

@@ -38,7 +38,8 @@ _MATTERS = 0.03
 _RARE = 10.0
 # Least change of a drive's inertia for a claim of its own, in standard deviations.
 _CLEAR = 4.0
-# Confidence in wear of friction alone: a drive warmer or colder in all sessions looks the same.
+# Confidence in wear of friction alone: a drive warmer or colder in all sessions looks the same. And in that of an
+# inertia with an unknown stiffness of the joints, whose share in it changes with the motion.
 _WORN_OR_WARM = 0.75
 _TELL_APART = "the same motion with joint {joint} cold and warm: wear stays, warmth goes"
 
@@ -103,6 +104,7 @@ def wear(
             continue
         labels = [names[nominal.base.names[k]] for k in places]
         sizes = dict(zip(labels, np.abs(share / std).tolist(), strict=True))
+        elastic = bool(nominal.arm.compliance[joint] > 0.0)
         heavier = sizes.get("inertia", 0.0) > max(_CLEAR, 0.5 * max(sizes.values()))
         torque = nominal.rows["motor"].matrix[joint][:, places] @ change
         columns = [*claimed, *tolerated, {("motor", joint): torque[:, None]}]
@@ -121,7 +123,7 @@ def wear(
                     for label, value, s in zip(labels, share, std, strict=True)
                 },
                 Evident(-square, p_value, before, rms, (before - rms, before - rms)),
-                sure if heavier else min(sure, _WORN_OR_WARM),
+                sure if heavier and elastic else min(sure, _WORN_OR_WARM),
                 () if heavier else ((FRICTION_TEMPERATURE.cause, (joint + 1,), -square),),
                 _TELL_APART.format(joint=joint + 1),
                 square,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,8 +10,10 @@ import pytest
 
 from fri.errors import ConfigurationError
 from ident.diagnosis.candidates import Candidate, Trial
+from ident.diagnosis.confidence import Grounds
+from ident.diagnosis.confirmation import _plain
 from ident.diagnosis.evidence import Score
-from ident.diagnosis.selection import State
+from ident.diagnosis.selection import Claim, State
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.usual_sizes import Healthy, UsualSize, scatter_limits, usual_sizes
 from ident.effects import EFFECTS, Shape
@@ -83,6 +86,14 @@ def test_a_constant_misfit_hides_no_change_of_the_same_candidate() -> None:
     assert not state(1.0, 150.0).unusual(trial)
     assert not state(2.0, 50.0).unusual(trial)
     assert not State(dictionary, None, DiagnosisSettings(), Healthy({KEY: 1000.0})).unusual(trial)  # type: ignore[arg-type]
+
+
+def test_a_claim_by_its_change_alone_is_no_plain_one() -> None:
+    claim = Claim(Trial(Candidate(EFFECTS["stribeck"], 0), Shape(velocity=0.05), score(2.0), {}), score(2.0))
+    grounds = Grounds(3.0, 9.0, 4.0, 3.0, 0.0, 0.2, 0.0, 0.0)
+    finding = SimpleNamespace(mode=None)
+    assert _plain(claim, finding, None, grounds, (1.0, 2.0))  # type: ignore[arg-type]
+    assert not _plain(replace(claim, changed_alone=True), finding, None, grounds, (1.0, 2.0))  # type: ignore[arg-type]
 
 
 def test_limits_of_scatter_lean_on_the_other_joints() -> None:
