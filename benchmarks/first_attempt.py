@@ -12,10 +12,11 @@ import os
 import re
 import subprocess
 import sys
-import tarfile
 import tempfile
 import time
 from pathlib import Path
+
+from tests.archives import unpack
 
 CASES = {
     "LWR4+, runs 1 and 2 to run 3": (
@@ -57,8 +58,7 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        with tarfile.open(options.data / "iiwa14/friction_sweeps_J4_J5_J6.tar.xz") as archive:
-            archive.extractall(place / "sweeps", filter="data")
+        unpack(options.data / "iiwa14/friction_sweeps_J4_J5_J6.tar.xz", place / "sweeps")
         mapped = place / "tx40.mcap"
         urdf = options.data / "tx40/tx40_mdh_modified.urdf"
         _, imported = run(["import", "tx40", str(options.data / "tx40"), str(mapped), "--urdf", str(urdf)])

@@ -8,7 +8,6 @@ HarvardAgileRoboticsLab/drake).
 
 from __future__ import annotations
 
-import tarfile
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -25,6 +24,7 @@ from ident.dynamics.structure import Coupling
 from ident.import_log import LogMapping, import_log
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
+from tests.archives import unpack
 
 __all__ = ["iiwa14", "tx40", "unseen"]
 
@@ -82,8 +82,7 @@ def iiwa14(folder: Path) -> None:
     chain = Chain.from_urdf(folder / "iiwa14.urdf")
     known = ArmData(gear_ratio=np.array([160.0, 160.0, 160.0, 160.0, 100.0, 160.0, 160.0]))
     with tempfile.TemporaryDirectory() as place:
-        with tarfile.open(folder / "friction_sweeps_J4_J5_J6.tar.xz") as bundle:
-            bundle.extractall(place, filter="data")
+        unpack(folder / "friction_sweeps_J4_J5_J6.tar.xz", Path(place))
         for title, names in _SWEEPS.items():
             start = time.process_time()
             sweeps = [_imported("iiwa14", Path(place) / "friction_model" / name) for name in names]

@@ -17,14 +17,13 @@ from ident.diagnosis.confidence import LIMITS, Grounds, probability
 from ident.diagnosis.reference import Reference, announced_masses, shared
 from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.task import Task
-from ident.effects import EFFECTS
+from ident.effects import PAYLOAD_ERROR
 from ident.estimators.estimate import fisher_tail
 
 # Least difference of a mass as a share of the expected one, and the largest probability of such a one by chance.
 _OTHER, _ONE_IN = 0.05, 1e-3
 # Standard deviation of a mass without a healthy one, as a share of it: the gains of the sensors act on it.
 _WEIGHED = 0.02
-_PAYLOAD = EFFECTS["payload_error"]
 
 
 @dataclass(frozen=True)
@@ -97,14 +96,14 @@ def payload_finding(one: OtherMass) -> Finding:
         worse=0.0,
     )
     return Finding(
-        _PAYLOAD.cause,
-        _PAYLOAD.side,
+        PAYLOAD_ERROR.cause,
+        PAYLOAD_ERROR.side,
         (),
         {"mass": Value(one.mass - one.expected, one.std, "kg")},
         Evident(-square, 1e-12, 0.0, 0.0, (0.0, 0.0)),
         probability(grounds),
         (),
-        _PAYLOAD.tell_apart,
+        PAYLOAD_ERROR.tell_apart,
         square,
         grounds=grounds.to_dict(),
     )

@@ -39,6 +39,7 @@ __all__ = [
     "FRICTION_TEMPERATURE",
     "LOST_SAMPLES",
     "NAMELESS",
+    "PAYLOAD_ERROR",
     "PRESLIDING",
     "SENSOR_GAIN",
     "WEAR",
@@ -69,6 +70,7 @@ FRICTION_TEMPERATURE = drive.FrictionTemperature()
 PRESLIDING = drive.PreslidingHysteresis()
 ELASTICITY = link.JointElasticity()
 BASE_TILT = link.BaseTilt()
+PAYLOAD_ERROR = load.PayloadError()
 SENSOR_GAIN = channel.SensorGain()
 ZERO_OFFSET = link.JointZeroOffset()
 LOST_SAMPLES = channel.LostSamples()
@@ -91,7 +93,7 @@ EFFECTS: dict[str, Effect] = {
         ELASTICITY,
         link.CableSpring(),
         BASE_TILT,
-        load.PayloadError(),
+        PAYLOAD_ERROR,
         load.PayloadChange(),
         ZERO_OFFSET,
         link.EncoderEccentricity(),

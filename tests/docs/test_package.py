@@ -9,7 +9,6 @@ import shutil
 import site
 import subprocess
 import sys
-import tarfile
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
@@ -18,6 +17,7 @@ import pytest
 import yaml
 
 from runner.computer import git_commit
+from tests.archives import unpack
 from tests.docs.conftest import SHORT
 from tests.docs.markdown import ROOT
 
@@ -67,8 +67,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copy(ROOT / name, source / name)
     subprocess.run(["git", "reset", "--quiet"], cwd=source, check=True)
     archive = build("build_sdist", source, place)
-    with tarfile.open(archive) as content:
-        content.extractall(place, filter="data")
+    unpack(archive, place)
     return build("build_wheel", place / archive.name.removesuffix(".tar.gz"), place)
 
 

@@ -6,7 +6,6 @@ Other software on the LWR4+ runs, relative error over all joints: FloBaRoID with
 
 from __future__ import annotations
 
-import tarfile
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from ident.import_log import LogMapping, import_log
 from ident.model.dynamic_model import DynamicModel
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
+from tests.archives import unpack
 from tests.ident.real.real_lwr4 import DATA, EVERY, chain, mounted, needs_recordings, repeatability, session
 
 SURE = 0.8
@@ -143,8 +143,7 @@ def test_drives_of_the_tx40_grow_slower_than_speed(tmp_path: Path) -> None:
 def test_torque_of_the_iiwas_wrist_repeats_with_its_angle(tmp_path: Path) -> None:
     """Sweeps of joint 6 at three speeds, the others at rest: of them nothing is said."""
     folder = other("iiwa14")
-    with tarfile.open(folder / "friction_sweeps_J4_J5_J6.tar.xz") as bundle:
-        bundle.extractall(tmp_path, filter="data")
+    unpack(folder / "friction_sweeps_J4_J5_J6.tar.xz", tmp_path)
     speeds = ("vel_p2", "vel_p5", "vel_p9")
     logs = [
         imported("iiwa14", tmp_path / "friction_model" / "joint6" / s, tmp_path / f"{s}.mcap") for s in speeds

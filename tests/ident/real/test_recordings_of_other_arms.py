@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from ident.rows.filters import SignalSettings
 from ident.rows.timebase import flag_outliers
 from lwr_driver.configuration import CONFIGS
 from lwr_driver.session import read_session
+from tests.archives import unpack
 
 DATA = CONFIGS.parents[1] / "shared" / "data"
 
@@ -155,8 +155,7 @@ def test_lwr4_repeat_is_predicted_and_another_trajectory_less_so(tmp_path: Path)
 
 def test_iiwa_torque_has_the_sign_of_gravity_and_the_loop_of_friction(tmp_path: Path) -> None:
     data = folder("iiwa14")
-    with tarfile.open(data / "friction_sweeps_J4_J5_J6.tar.xz") as bundle:
-        bundle.extractall(tmp_path, filter="data")
+    unpack(data / "friction_sweeps_J4_J5_J6.tar.xz", tmp_path)
     sweep = tmp_path / "friction_model" / "joint4" / "vel_p2"
     session = read_session(import_log(LogMapping.load("iiwa14"), sweep, tmp_path / "sweep.mcap").path)
     chain = Chain.from_urdf(data / "iiwa14.urdf")
