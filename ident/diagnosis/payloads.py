@@ -14,7 +14,7 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import LIMITS, Grounds, probability
-from ident.diagnosis.reference import Reference, announced_masses, shared
+from ident.diagnosis.reference import WEIGHED, Reference, announced_masses
 from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.task import Task
 from ident.effects import PAYLOAD_ERROR
@@ -22,8 +22,6 @@ from ident.estimators.estimate import fisher_tail
 
 # Least difference of a mass as a share of the expected one, and the largest probability of such a one by chance.
 _OTHER, _ONE_IN = 0.05, 1e-3
-# Standard deviation of a mass without a healthy one, as a share of it: the gains of the sensors act on it.
-_WEIGHED = 0.02
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ def other_masses(bench: DiagnosisBench, reference: Reference | None) -> list[Oth
     freedom = bench.nominal.arm.chain.n * max(1 if reference is None else reference.sets, 1)
     found = []
     for k, (payload, stated) in announced.items():
-        expected, usual = healthy.get(k, (stated, (_WEIGHED * stated) ** 2))
+        expected, usual = healthy.get(k, (stated, (WEIGHED * stated) ** 2))
         std = float(np.sqrt(max(covariance[k, k], 0.0) + usual))
         one = OtherMass(payload, float(values[k]), expected, std)
         away = one.mass - expected
@@ -71,15 +69,10 @@ def other_masses(bench: DiagnosisBench, reference: Reference | None) -> list[Oth
 def _healthy(bench: DiagnosisBench, reference: Reference) -> dict[int, tuple[float, float]]:
     """Value and variance on the healthy arm of the base parameters shared with it, by place."""
     own = reference.model
-    if own.base is None or own.covariance is None:
+    if own.covariance is None:
         return {}
-    place = {int(p): k for k, p in enumerate(own.positions)}
-    pairs = shared(own.base, bench.nominal.base, reference.masses, bench.nominal.masses)
-    return {
-        b: (float(own.values[place[a]]), float(own.covariance[place[a], place[a]]))
-        for a, b in pairs
-        if a in place
-    }
+    pairs = reference.common(bench.nominal.base, bench.nominal.masses)
+    return {b: (float(own.values[a]), float(own.covariance[a, a])) for a, b in pairs}
 
 
 def payload_finding(one: OtherMass) -> Finding:

@@ -29,6 +29,8 @@ from ident.model import DynamicModel, write_model
 
 DELAY_STD_S = 2e-4
 """Usual standard deviation [s] of a healthy channel's delay from day to day."""
+WEIGHED = 0.02
+"""Relative standard deviation of an announced mass."""
 INERTIA_BY_PHASE = 0.05
 """Largest effect of the phase of slow motor samples on a drive's inertia, as a share of it."""
 USUAL_DAYS = 4
@@ -47,8 +49,6 @@ _OFFSETS = ("offl", "offm")
 # Weight of the scatter of a symbol beside that of a parameter, and of the expected scatter beside the symbol's, in
 # changes.
 _ALIKE = 4.0
-# Relative standard deviation of an announced mass.
-_WEIGHED = 0.02
 # Relative error within which a stiffness counts as known.
 _STIFFNESS_WITHIN = 0.2
 _ONE_IN = 0.01
@@ -257,6 +257,14 @@ class Reference:
         more = np.diag(np.where(mine, share * model.values, 0.0) ** 2)
         return replace(self, model=replace(model, covariance=model.covariance + more))
 
+    def common(self, base: BaseSet, masses: Mapping[str, float | None]) -> list[tuple[int, int]]:
+        """Places in the model's values and in a base set of the parameters that both have, see `shared`."""
+        own = self.model
+        if own.base is None:
+            return []
+        mine = {int(p): k for k, p in enumerate(own.positions)}
+        return [(mine[a], b) for a, b in shared(own.base, base, self.masses, masses) if a in mine]
+
     def prior(
         self, base: BaseSet, masses: Mapping[str, float | None] | None = None, *, wider: float = _WIDER
     ) -> tuple[Floats, Floats] | None:
@@ -270,9 +278,7 @@ class Reference:
         own = self.model
         if own.covariance is None or own.base is None:
             return None
-        pairs = shared(own.base, base, self.masses, masses)
-        mine = {int(p): k for k, p in enumerate(own.positions)}
-        pairs = [(mine[a], b) for a, b in pairs if a in mine]
+        pairs = self.common(base, masses)
         if not pairs:
             return None
         here, there = np.array([b for _, b in pairs]), np.array([a for a, _ in pairs])
@@ -288,7 +294,7 @@ class Reference:
         mean[here] = values
         for k, (_, mass) in announced_masses(base, masses).items():
             if k not in here:
-                precision[k, k], mean[k] = 1.0 / (_WEIGHED * mass) ** 2, mass
+                precision[k, k], mean[k] = 1.0 / (WEIGHED * mass) ** 2, mass
         return precision, mean
 
 
