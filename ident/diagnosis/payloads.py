@@ -18,7 +18,7 @@ from ident.diagnosis.reference import WEIGHED, Reference, announced_masses
 from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.task import Task
 from ident.effects import PAYLOAD_ERROR
-from ident.estimators.estimate import fisher_tail
+from ident.estimators.estimate import fisher_limit
 
 # Least difference of a mass as a share of the expected one, and the largest probability of such a one by chance.
 _OTHER, _ONE_IN = 0.05, 1e-3
@@ -26,12 +26,20 @@ _OTHER, _ONE_IN = 0.05, 1e-3
 
 @dataclass(frozen=True)
 class OtherMass:
-    """A payload whose mass by these sessions alone is not the expected one [kg]. std : of the difference."""
+    """A payload whose mass by these sessions alone is not the expected one [kg]. std : of the difference; least :
+    difference in squares of `std` that is hardly chance.
+    """
 
     payload: str
     mass: float
     expected: float
     std: float
+    least: float
+
+    @property
+    def square(self) -> float:
+        """The difference in squares of `std`."""
+        return ((self.mass - self.expected) / max(self.std, 1e-12)) ** 2
 
     @property
     def text(self) -> str:
@@ -54,14 +62,13 @@ def other_masses(bench: DiagnosisBench, reference: Reference | None) -> list[Oth
     evidence.replace(kept)
     healthy = {} if reference is None else _healthy(bench, reference)
     freedom = bench.nominal.arm.chain.n * max(1 if reference is None else reference.sets, 1)
+    least = fisher_limit(_ONE_IN, 1, freedom)
     found = []
     for k, (payload, stated) in announced.items():
         expected, usual = healthy.get(k, (stated, (WEIGHED * stated) ** 2))
         std = float(np.sqrt(max(covariance[k, k], 0.0) + usual))
-        one = OtherMass(payload, float(values[k]), expected, std)
-        away = one.mass - expected
-        p_value = fisher_tail((away / max(std, 1e-12)) ** 2, 1, freedom)
-        if abs(away) > _OTHER * expected and p_value < _ONE_IN:
+        one = OtherMass(payload, float(values[k]), expected, std, least)
+        if abs(one.mass - expected) > _OTHER * expected and one.square > least:
             found.append(one)
     return found
 
@@ -77,9 +84,8 @@ def _healthy(bench: DiagnosisBench, reference: Reference) -> dict[int, tuple[flo
 
 def payload_finding(one: OtherMass) -> Finding:
     """The finding of a payload of another mass."""
-    square = ((one.mass - one.expected) / one.std) ** 2
     grounds = Grounds(
-        gain=float(np.log(square)),
+        gain=float(np.log(one.square / one.least)),
         significance=LIMITS["significance"][1],
         rivals=LIMITS["rivals"][1],
         held_out=0.0,
@@ -93,11 +99,11 @@ def payload_finding(one: OtherMass) -> Finding:
         PAYLOAD_ERROR.side,
         (),
         {"mass": Value(one.mass - one.expected, one.std, "kg")},
-        Evident(-square, 1e-12, 0.0, 0.0, (0.0, 0.0)),
+        Evident(-one.square, 1e-12, 0.0, 0.0, (0.0, 0.0)),
         probability(grounds),
         (),
         PAYLOAD_ERROR.tell_apart,
-        square,
+        one.square,
         grounds=grounds.to_dict(),
     )
 

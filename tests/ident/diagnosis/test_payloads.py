@@ -61,7 +61,7 @@ def test_an_uncertain_or_small_difference_is_none(base: BaseSet, mass: float, st
 
 
 def test_the_finding_says_the_mass_and_is_surer_for_a_clearer_one() -> None:
-    clear, faint = (payload_finding(OtherMass("weight", 2.0 + more, 2.0, 0.04)) for more in (0.8, 0.2))
+    clear, faint = (payload_finding(OtherMass("weight", 2.0 + more, 2.0, 0.04, 12.0)) for more in (0.8, 0.2))
     assert clear.cause == "payload_error"
     assert clear.parameters["mass"].value == pytest.approx(0.8)
     assert clear.confidence > faint.confidence > 0.5
