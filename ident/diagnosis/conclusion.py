@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,29 +14,23 @@ from ident.diagnosis.evidence import Floats
 from ident.diagnosis.extension import (
     Member,
     extension,
-    held_out_with,
-    nameless_terms,
     power_left,
     title,
     torque_error,
 )
 from ident.diagnosis.findings import loss_finding
-from ident.diagnosis.held_out import HeldOut, held_out
-from ident.diagnosis.nominal import GAIN_STD, TRAVEL_RAD, Nominal
+from ident.diagnosis.held_out import held_out
+from ident.diagnosis.models import changes_of, fitted_models, lasting, without_harm
+from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
 from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.refit import left_by, refitted
-from ident.diagnosis.result import Diagnosis, Finding, Nameless, RowStates, Unexplained
+from ident.diagnosis.result import Diagnosis, Finding, RowStates, Unexplained
 from ident.diagnosis.task import Baseline, State, Task
 from ident.diagnosis.tolerances import GAIN
 from ident.diagnosis.wear import is_level, wear
-from ident.effects import EFFECTS, SENSOR_GAIN, entry_of
-from ident.model import DynamicModel
-from ident.model.signals import SIGNALS, signals_entry
+from ident.effects import EFFECTS
 from ident.rows.data_quality import sample_loss
-
-# Least error of a sensor's gain in the models, in its standard deviations and in those from day to day.
-_CLEAR, _MATTERS = 2.0, 0.5
 
 
 def conclude(task: Task, state: State) -> Diagnosis:
@@ -46,7 +38,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
     bench, nuisance, settings = state.bench, state.selection.nuisance_rows, task.settings
     evidence, nominal = bench.evidence, bench.nominal
     baseline = state.baseline if state.timing else None
-    baseline = baseline or Baseline.of(bench, nuisance)
+    baseline = baseline or Baseline.of(bench, nuisance, lasting(state.selection))
     kept = [one for one in confirmed(task, state) if not is_level(one.claim)]
     evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])
     remainders = find_remainders(bench.dictionary, evidence, settings, task.limits)
@@ -81,7 +73,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
     by_identify = task.sound and evidence.drawn
     refuted: list[Finding] = []
     if not by_identify:
-        members, after, refuted = _predicting(task, state, baseline, members, after)
+        members, after, refuted = without_harm(task, state, baseline, members, after)
     findings = [contradicted(f) if any(f is r for r in refuted) else f for f in findings]
     doubts += [f for f in findings if not believable(f.grounds)]
     findings = [f for f in findings if believable(f.grounds)]
@@ -90,15 +82,16 @@ def conclude(task: Task, state: State) -> Diagnosis:
     if loss:
         findings.append(loss_finding(loss[0]))
     findings.sort(key=lambda f: -f.gain)
-    base_model, extended, nameless = _models(task, state, baseline, members, after)
-    changes = _changes(base_model, extended) if extended.effects != base_model.effects else {}
+    made = fitted_models(task, state, baseline, members, after)
+    base_model, extended = made.base, made.extended
+    changes = changes_of(base_model, extended) if made.added else {}
     before, after = baseline.held.where(after), after.where(baseline.held)
     extended_rms = after.rms()
-    added = tuple(title(entry) for entry in extended.effects[len(base_model.effects) :])
+    added = tuple(map(title, made.added))
     notes = state.notes
     if by_identify:
         try:
-            base_model, extended = refitted(task, nominal, extended.effects[len(base_model.effects) :])
+            base_model, extended = refitted(task, nominal, made.added)
         except DataError as error:
             notes = (*notes, f"the models are those of the evidence, for `identify` says: {error}")
         else:
@@ -110,8 +103,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
                 extended_rms = after.rms()
             own = {title(entry) for entry in base_model.effects}
             added = tuple(name for name in map(title, extended.effects) if name not in own)
-            changes = _changes(base_model, extended) if added else {}
-    fitted = {(term.side, term.joint) for term in nameless}
+            changes = changes_of(base_model, extended) if added else {}
+    fitted = {(term.side, term.joint) for term in made.nameless}
     left = [
         (r.side, r.joint, r.depends_on)
         for r in remainders
@@ -131,7 +124,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         findings=tuple(f for f in findings if not is_character[id(f)]),
         character=tuple(f for f in findings if is_character[id(f)]),
         doubted=tuple(doubts),
-        nameless=nameless,
+        nameless=made.nameless,
         extension=added,
         unexplained=tuple(
             Unexplained(
@@ -153,98 +146,6 @@ def conclude(task: Task, state: State) -> Diagnosis:
         residuals={"base": before.residual, "extended": after.residual},
         states={side: _states(nominal, side, before.block[side]) for side in nominal.rows},
     )
-
-
-# ---- models ----
-
-
-def _models(
-    task: Task, state: State, baseline: Baseline, members: Sequence[Member], after: HeldOut
-) -> tuple[DynamicModel, DynamicModel, tuple[Nameless, ...]]:
-    """Base model, extended model with the members and the late channels, and the members without a name.
-
-    after : held-out rows with the members; the columns of the evidence are theirs.
-    """
-    bench, nuisance = state.bench, state.selection.nuisance_rows
-    evidence, nominal = bench.evidence, bench.nominal
-    p = evidence.base_count
-    nameless = nameless_terms(bench, members, nuisance, after, task.settings.seed)
-    named = [m.finding for m in members if m.finding is not None]
-    effects = [*map(_entry, (*named, *state.timing)), *(e for term in nameless for e in term.entries)]
-    robot = task.sessions[0].metadata.get("robot", "") or "arm"
-    provenance: dict[str, Any] = {
-        "sessions": [r.name for r in nominal.recordings if not r.test],
-        "estimator": "diagnosis",
-        SIGNALS: signals_entry(task.settings.signals) | {"motor_delay_s": nominal.arm.motor_delay_s},
-    }
-    structure = replace(nominal.structure, coulomb=task.settings.law or nominal.structure.coulomb)
-    base = DynamicModel(
-        robot,
-        structure,
-        nominal.base.names,
-        baseline.values,
-        baseline.covariance,
-        replace(nominal.base, structure=structure),
-        provenance,
-        (*nominal.arm.healthy, *_gains(state.selection.nuisance)),
-    )
-    values, covariance = evidence.full.values[:p].copy(), evidence.covariance()[:p, :p]
-    extended = replace(base, values=values, covariance=covariance, effects=(*base.effects, *effects))
-    return base, extended, nameless
-
-
-def _predicting(
-    task: Task, state: State, baseline: Baseline, members: list[Member], after: HeldOut
-) -> tuple[list[Member], HeldOut, list[Finding]]:
-    """The members without those that raise the torque error of the held-out sessions, the rows with them, and the
-    findings that went.
-
-    The rows end at the parallel filter's band; the torque error has all samples, as users compute the torque.
-    """
-    if not task.test or not members:
-        return members, after, []
-    bench, nuisance = state.bench, state.selection.nuisance_rows
-    refuted: list[Finding] = []
-    base, extended, _ = _models(task, state, baseline, members, after)
-    limit, left = (torque_error(model, task.test) for model in (base, extended))
-    while members and left > limit:
-        found = []
-        for member in members:
-            rest = [m for m in members if m is not member]
-            held = held_out_with(bench, rest, nuisance)
-            model = _models(task, state, baseline, rest, held)[1]
-            found.append((torque_error(model, task.test), member))
-        left, worst = min(found, key=lambda pair: pair[0])
-        members = [m for m in members if m is not worst]
-        refuted += [worst.finding] if worst.finding is not None else []
-        after = held_out_with(bench, members, nuisance)
-    return members, after, refuted
-
-
-def _changes(base: DynamicModel, extended: DynamicModel) -> dict[str, float]:
-    """Largest changes of the base parameters beyond two standard deviations, in these; none between different bases."""
-    if extended.std is None or base.names != extended.names:
-        return {}
-    shift = (extended.values - base.values) / np.maximum(extended.std, 1e-300)
-    order = np.argsort(-np.abs(shift))[:10]
-    return {base.names[k]: float(shift[k]) for k in order if abs(shift[k]) > 2.0}
-
-
-def _gains(nuisance: Mapping[str, tuple[float, float]]) -> list[dict[str, Any]]:
-    """Entries of the tolerated errors of the torque sensors' gains beyond their own uncertainty: both models predict
-    what these sensors show."""
-    found = []
-    for name, (value, std) in nuisance.items():
-        what, _, joint = name.rpartition(" ")
-        if what == GAIN and abs(value) > max(_CLEAR * std, _MATTERS * GAIN_STD):
-            found.append(entry_of(SENSOR_GAIN, [int(joint)], {"error": (value, std)}))
-    return found
-
-
-def _entry(finding: Finding) -> dict[str, Any]:
-    content = finding.to_dict()
-    names = ("cause", "side", "joints", "form", "parameters")
-    return {name: content[name] for name in names if name in content}
 
 
 def _states(nominal: Nominal, side: str, block: Floats) -> RowStates:

@@ -29,6 +29,7 @@ from ident.diagnosis.conclusion import conclude
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import confirmed_delay
 from ident.diagnosis.evidence import Score
+from ident.diagnosis.models import lasting
 from ident.diagnosis.payloads import other_masses, payload_finding, with_masses
 from ident.diagnosis.recording import record, settled, usual_step
 from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
@@ -157,7 +158,11 @@ def _in_time(task: Task, state: State) -> State:
     if not late:
         return replace(state, left_out=tuple(doubtful))
     named = zip(state.selection.nuisance, state.selection.nuisance_rows, strict=True)
-    baseline = Baseline.of(state.bench, [rows for name, rows in named if "delay" not in name])
+    baseline = Baseline.of(
+        state.bench,
+        [rows for name, rows in named if "delay" not in name],
+        {name: rows for name, rows in lasting(state.selection).items() if "delay" not in name},
+    )
     shifted, bench, amounts = task.arm, state.bench, {c.trial.candidate.cause: _made(c) for c in late}
     healthy = _at_another_phase(task.reference) if DELAYS["motor"].cause in amounts else task.reference
     for _ in range(_SHIFTS):

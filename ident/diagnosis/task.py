@@ -6,8 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from ident.diagnosis.bench import DiagnosisBench, prepare_bench
-from ident.diagnosis.evidence import Floats, Rows
+from ident.diagnosis.evidence import Evidence, Floats, Rows
 from ident.diagnosis.held_out import HeldOut, held_out
 from ident.diagnosis.nominal import NominalArm
 from ident.diagnosis.recording import SessionRecord
@@ -69,19 +71,37 @@ class Task:
 
 
 @dataclass(frozen=True, eq=False)
-class Baseline:
-    """The base model alone: its residuals on held-out rows, its parameters (p,) and their covariance."""
+class ModelFit:
+    """A fit of a model: base parameters (p,), their covariance, and value and standard deviation of each tolerated
+    deviation beside them."""
 
-    held: HeldOut
     values: Floats
     covariance: Floats
+    beside: Mapping[str, tuple[float, float]]
 
     @classmethod
-    def of(cls, bench: DiagnosisBench, tolerated: Sequence[Rows]) -> Baseline:
-        """Fitted on a bench, with tolerated deviations."""
-        evidence = bench.evidence
-        held, p = held_out(evidence, tolerated), evidence.base_count
-        return cls(held, evidence.full.values[:p].copy(), evidence.covariance()[:p, :p])
+    def of(cls, evidence: Evidence, columns: Sequence[Rows], beside: Mapping[str, Rows]) -> ModelFit:
+        """Fitted with columns of the model and tolerated deviations of one column each; all stay in the evidence."""
+        evidence.replace([*columns, *beside.values()])
+        p, values, covariance = evidence.base_count, evidence.full.values, evidence.covariance()
+        first = len(values) - len(beside)
+        deviations = np.sqrt(np.maximum(np.diag(covariance)[first:], 0.0))
+        pairs = zip(values[first:].tolist(), deviations.tolist(), strict=True)
+        return cls(values[:p].copy(), covariance[:p, :p], dict(zip(beside, pairs, strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class Baseline:
+    """The base model alone: its residuals on held-out rows beside what differs from day to day, and its fit."""
+
+    held: HeldOut
+    fit: ModelFit
+
+    @classmethod
+    def of(cls, bench: DiagnosisBench, tolerated: Sequence[Rows], lasting: Mapping[str, Rows]) -> Baseline:
+        """Fitted on a bench. tolerated : deviations beside the rows. lasting : those beside the model."""
+        held = held_out(bench.evidence, tolerated)
+        return cls(held, ModelFit.of(bench.evidence, (), lasting))
 
 
 @dataclass(frozen=True, eq=False)

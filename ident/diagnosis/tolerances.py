@@ -28,6 +28,10 @@ HABITUAL = 3.0
 """Largest change from day to day, in standard deviations."""
 GAIN = "gain"
 """Name of the tolerated deviation of a torque sensor's gain, before the number of its joint."""
+COMPLIANCE = "compliance"
+"""The same for a joint's compliance."""
+LENGTH = "presliding"
+"""The same for the presliding length of a drive, a share of it."""
 
 
 class Tolerance(NamedTuple):
@@ -59,7 +63,9 @@ def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSe
             rows = dictionary.rows(Candidate(ELASTICITY, joint), shape)
             if rows:
                 size = share * float(nominal.arm.compliance[joint])
-                found.append(Tolerance(f"compliance {joint + 1}", rows, 1.0, size, (ELASTICITY.cause, joint)))
+                found.append(
+                    Tolerance(f"{COMPLIANCE} {joint + 1}", rows, 1.0, size, (ELASTICITY.cause, joint))
+                )
     if evidence.compared:
         # Without a reference the gains of the sensors are hardly distinguishable from a scale of all masses.
         size = HABITUAL * nominal.arm.gain_std
@@ -68,7 +74,7 @@ def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSe
             for j, rows in gain_rows(dictionary).items()
         ]
         found += [
-            Tolerance(f"presliding {j + 1}", rows, 1.0, HABITUAL * _LENGTH_STD, (PRESLIDING.cause, j))
+            Tolerance(f"{LENGTH} {j + 1}", rows, 1.0, HABITUAL * _LENGTH_STD, (PRESLIDING.cause, j))
             for j, rows in _presliding_rows(dictionary).items()
         ]
     return found

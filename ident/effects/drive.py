@@ -93,17 +93,18 @@ class PreslidingHysteresis(Effect):
         return (Column(motor=state - motion.direction[:, joint]),)
 
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
-        """Moves the amplitude from the set-valued friction to Dahl's."""
+        """Moves the amplitude from the set-valued friction to Dahl's: the drive's, then that of the link, which holds
+        both where no joint torque was measured."""
         joint, amplitude = run.joint, run.values["amplitude"]
+        loads.Fcl[joint] = max(0.0, loads.Fcl[joint] - max(0.0, amplitude - loads.Fcm[joint]))
+        loads.Fcm[joint] = max(0.0, loads.Fcm[joint] - amplitude)
         if run.shape.form is _Turning.SMOOTH:
             # As a viscous friction it is integrated with the speed, stable for any slope.
             speed, slow = float(plant.motor_velocity[joint]), run.values["velocity"]
-            loads.Fcm[joint] = max(0.0, loads.Fcm[joint] - amplitude)
             secant = np.tanh(speed / slow) / speed if abs(speed) > 1e-6 * slow else 1.0 / slow
             loads.Fvm[joint] += amplitude * secant
             return
         state = dahl_step(run, float(plant.motor_position[joint]), run.values["length"])
-        loads.Fcm[joint] = max(0.0, loads.Fcm[joint] - amplitude)
         loads.motor_torque[joint] -= amplitude * state
 
 

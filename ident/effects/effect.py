@@ -202,6 +202,7 @@ class Loads(Protocol):
     Fvm: Floats
     Fcm: Floats
     offm: Floats
+    Fcl: Floats
 
 
 class Reading(Protocol):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from ident.diagnosis import Diagnosis, conclusion, diagnose
+from ident.diagnosis import Diagnosis, diagnose, models
 from ident.diagnosis.extension import torque_error
 from ident.dynamics.kinematics import Chain
 from ident.estimation.validate import validate
@@ -52,7 +52,7 @@ def test_an_effect_that_raises_the_torque_error_is_not_in_the_extension(
         joints = [entry["joints"] for entry in model.effects]
         return 1.0 + 2.0 * ([harmful] in joints) - 0.5 * (len(joints) > 0)
 
-    monkeypatch.setattr(conclusion, "torque_error", measured)
+    monkeypatch.setattr(models, "torque_error", measured)
     told = found(logs, chain)
     other = 5 - harmful
     assert [entry["joints"] for entry in told.extended_model.effects] == [[other]]

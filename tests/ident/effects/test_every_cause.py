@@ -151,6 +151,7 @@ def simulated(
             link_torque=np.zeros(7),
             Fvm=np.full(7, VISCOUS),
             Fcm=np.full(7, COULOMB),
+            Fcl=np.zeros(7),
             offm=np.zeros(7),
         )
         reading = SimpleNamespace(

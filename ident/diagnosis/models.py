@@ -1,0 +1,178 @@
+"""The models of a diagnosis: the base model, and the extended one with what was found.
+
+Beside every cause the evidence tolerates what differs between healthy days. A day's change is no part of a model: so
+each model is fitted with exactly the columns that it holds, beside delays and stiffness, which are no torques. Drives
+with a presliding length turn their friction over it in the models as in the rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ident.diagnosis.bench import DiagnosisBench
+from ident.diagnosis.evidence import Rows
+from ident.diagnosis.extension import Member, held_out_with, nameless_terms, torque_error
+from ident.diagnosis.held_out import HeldOut
+from ident.diagnosis.nominal import GAIN_STD
+from ident.diagnosis.result import Finding, Nameless
+from ident.diagnosis.selection import Selection
+from ident.diagnosis.task import Baseline, ModelFit, State, Task
+from ident.diagnosis.tolerances import COMPLIANCE, GAIN, LENGTH
+from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of, parameter_values
+from ident.model import DynamicModel
+from ident.model.signals import SIGNALS, signals_entry
+
+Entries = tuple[Mapping[str, Any], ...]
+
+# Least error of a sensor's gain in the models, in its standard deviations and in those from day to day.
+_CLEAR, _MATTERS = 2.0, 0.5
+
+
+def lasting(selection: Selection) -> dict[str, Rows]:
+    """The tolerated deviations that stay beside the columns of a model: delays and stiffness, which are no torques,
+    and the gains of the torque sensors that are clear of zero, which the models predict as these sensors show them."""
+    found = {}
+    for (name, (value, std)), rows in zip(selection.nuisance.items(), selection.nuisance_rows, strict=True):
+        clear = abs(value) > max(_CLEAR * std, _MATTERS * GAIN_STD)
+        if "delay" in name or name.startswith(COMPLIANCE) or (name.startswith(GAIN) and clear):
+            found[name] = rows
+    return found
+
+
+class Models(NamedTuple):
+    """Base model, extended model, what this one has more, and the terms without a name among it."""
+
+    base: DynamicModel
+    extended: DynamicModel
+    added: Entries
+    nameless: tuple[Nameless, ...]
+
+
+def fitted_models(
+    task: Task, state: State, baseline: Baseline, members: Sequence[Member], after: HeldOut
+) -> Models:
+    """The models, the extended one with the members and the late channels.
+
+    after : held-out rows with the members; the columns of the evidence are theirs, before and afterwards.
+    """
+    bench, selection = state.bench, state.selection
+    evidence, nominal = bench.evidence, bench.nominal
+    nameless = nameless_terms(bench, members, selection.nuisance_rows, after, task.settings.seed)
+    named = [m.finding for m in members if m.finding is not None]
+    effects = (*map(_entry, (*named, *state.timing)), *(e for term in nameless for e in term.entries))
+    robot = task.sessions[0].metadata.get("robot", "") or "arm"
+    provenance: dict[str, Any] = {
+        "sessions": [r.name for r in nominal.recordings if not r.test],
+        "estimator": "diagnosis",
+        SIGNALS: signals_entry(task.settings.signals) | {"motor_delay_s": nominal.arm.motor_delay_s},
+    }
+    structure = replace(nominal.structure, coulomb=task.settings.law or nominal.structure.coulomb)
+    base = DynamicModel(
+        robot,
+        structure,
+        nominal.base.names,
+        baseline.fit.values,
+        baseline.fit.covariance,
+        replace(nominal.base, structure=structure),
+        provenance,
+    )
+    fit = ModelFit.of(evidence, [rows for m in members for rows in m.rows], lasting(selection))
+    evidence.replace([*(rows for m in members for rows in m.rows), *selection.nuisance_rows])
+    extended = replace(base, values=fit.values, covariance=fit.covariance)
+    return Models(
+        _with_effects(base, bench, selection, baseline.fit, ()),
+        _with_effects(extended, bench, selection, fit, effects),
+        effects,
+        nameless,
+    )
+
+
+def _with_effects(
+    model: DynamicModel, bench: DiagnosisBench, selection: Selection, fit: ModelFit, found: Entries
+) -> DynamicModel:
+    """The model with the healthy arm's effects, the gains of its sensors, the turning of its friction, and `found`."""
+    gains = [
+        entry_of(SENSOR_GAIN, [int(name.rpartition(" ")[2])], {"error": one})
+        for name, one in fit.beside.items()
+        if name.startswith(GAIN)
+    ]
+    turning = turning_friction(model, bench, selection, found)
+    return replace(model, effects=(*bench.nominal.arm.healthy, *gains, *turning, *found))
+
+
+def turning_friction(
+    model: DynamicModel, bench: DiagnosisBench, selection: Selection, found: Entries
+) -> list[dict[str, Any]]:
+    """Entries of the drives' friction that turns over the arm's presliding lengths of these days, but for what `found`
+    says of it."""
+    nominal = bench.nominal
+    arm, drive = nominal.arm, model.drive()
+    if arm.presliding is None or "motor" not in nominal.rows:
+        return []
+    # Without joint torques friction of link and drive is one.
+    level = drive["Fcm"] if "joint" in nominal.rows else drive["Fcm"] + drive["Fcl"]
+    entries = []
+    for joint in np.flatnonzero(arm.presliding > 0.0).tolist():
+        taken = sum(
+            parameter_values(e)["amplitude"]
+            for e in found
+            if e["cause"] == PRESLIDING.cause and joint + 1 in e["joints"]
+        )
+        left = max(float(level[joint]) - taken, 0.0)
+        longer, _ = selection.nuisance.get(f"{LENGTH} {joint + 1}", (0.0, 0.0))
+        far = 0.0 if arm.far_share is None else float(arm.far_share[joint])
+        parts = [(left * (1.0 - far), float(arm.presliding[joint]) * (1.0 + longer))]
+        if far and arm.far is not None:
+            parts.append((left * far, float(arm.far[joint])))
+        entries += [
+            entry_of(PRESLIDING, [joint + 1], {"amplitude": (amplitude, 0.0), "length": (length, 0.0)})
+            for amplitude, length in parts
+        ]
+    return entries
+
+
+def without_harm(
+    task: Task, state: State, baseline: Baseline, members: list[Member], after: HeldOut
+) -> tuple[list[Member], HeldOut, list[Finding]]:
+    """The members without those that raise the torque error of the held-out sessions, the rows with them, and the
+    findings that went.
+
+    The rows end at the parallel filter's band; the torque error has all samples, as users compute the torque.
+    """
+    if not task.test or not members:
+        return members, after, []
+    bench, nuisance = state.bench, state.selection.nuisance_rows
+    refuted: list[Finding] = []
+    made = fitted_models(task, state, baseline, members, after)
+    limit, left = (torque_error(model, task.test) for model in (made.base, made.extended))
+    while members and left > limit:
+        found = []
+        for member in members:
+            rest = [m for m in members if m is not member]
+            held = held_out_with(bench, rest, nuisance)
+            model = fitted_models(task, state, baseline, rest, held).extended
+            found.append((torque_error(model, task.test), member))
+        left, worst = min(found, key=lambda pair: pair[0])
+        members = [m for m in members if m is not worst]
+        refuted += [worst.finding] if worst.finding is not None else []
+        after = held_out_with(bench, members, nuisance)
+    return members, after, refuted
+
+
+def changes_of(base: DynamicModel, extended: DynamicModel) -> dict[str, float]:
+    """Largest changes of the base parameters beyond two standard deviations, in these; none between different bases."""
+    if extended.std is None or base.names != extended.names:
+        return {}
+    shift = (extended.values - base.values) / np.maximum(extended.std, 1e-300)
+    order = np.argsort(-np.abs(shift))[:10]
+    return {base.names[k]: float(shift[k]) for k in order if abs(shift[k]) > 2.0}
+
+
+def _entry(finding: Finding) -> dict[str, Any]:
+    content = finding.to_dict()
+    names = ("cause", "side", "joints", "form", "parameters")
+    return {name: content[name] for name in names if name in content}
