@@ -2,9 +2,10 @@
 
 Run `python -m benchmarks.reversals [--pairs 4] [--first-seed 700]`. Pairs of sessions of emulated arms, stiff and
 elastic, with and without friction that turns slowly after a reversal, and with friction that falls with the speed
-(Stribeck), are identified in five ways: all samples with sign(qd); all samples with tanh(qd / width) in the rows, the
+(Stribeck), are identified in six ways: all samples with sign(qd); all samples with tanh(qd / width) in the rows, the
 width chosen by held-back error; samples beside reversals left out, with that law in the rows; with sign(qd) in the
-rows and the law in the model; and slow motion left out besides (as it comes).
+rows and the law in the model; slow motion left out besides (as it comes); and as `lwr-run identify` does, with friction
+that turns over a path in the model.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import numpy as np
 from benchmarks.coverage import kind
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coulomb
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identify import AUTO, Identification, IdentificationSettings, identify
 from ident.estimation.validate import validate
 from ident.rows.filters import SignalSettings
 from lwr_driver.arm import Arm
@@ -54,7 +55,7 @@ _SHOWN = ("Ia", "Fvm", "Fcm")
 
 
 def ways(chosen: Identification) -> dict[str, IdentificationSettings]:
-    """The settings of the five ways, from an identification as it comes."""
+    """The settings of the six ways, from an identification as it comes."""
     settings, signals = chosen.settings, chosen.settings.signals
     assert settings.coulomb is not None
     everything = replace(signals, reversal_s=0.0, slow_rad_s=0.0, standstill_rad_s=0.0)
@@ -65,6 +66,7 @@ def ways(chosen: Identification) -> dict[str, IdentificationSettings]:
         "left out, smooth": replace(settings, signals=turning, row_coulomb=settings.coulomb),
         "left out, sign": replace(settings, signals=turning, row_coulomb=Coulomb()),
         "as it comes": settings,
+        "in the model": replace(settings, estimator=AUTO),
     }
 
 

@@ -90,6 +90,13 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         rsd = [one["rsd_percent"] for one in listed if one.get("rsd_percent") is not None]
         text += f", median relative std {float(np.median(rsd)):.2g} %" if rsd else ""
         found.append(("parameters", text))
+    turning = (summary.get("choice") or {}).get("friction_turns")
+    if turning:
+        lengths = [1e3 * one for one in turning["length_rad"].values()]
+        error = turning["torque_error_percent"]
+        text = f"of {len(lengths)} drives turns over {min(lengths):.2g} to {max(lengths):.2g} mrad, in the model: "
+        text += f"motor torque error of the fit {error['without']:.3g} -> {error['with']:.3g} %"
+        found.append(("friction", text))
     masses = [one for one in summary.get("parameters", ()) if _is_mass(one["name"])]
     if masses:
         text = ", ".join(_spread(one["estimate"], one["std"]) for one in masses)

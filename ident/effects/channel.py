@@ -36,6 +36,7 @@ class SensorGain(ScaleError):
     summary = "scale of the joint torque sensor"
     physics = "the strain gauges' bridge is calibrated wrongly"
     source = "Jubien, Gautier and Janot, IFAC 2014; Gautier and Briot, ICRA 2011"
+    remembers = False
     confused_with = ("sensor_crosstalk", "payload_error", "sensor_saturation")
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:

@@ -23,7 +23,7 @@ from ident.effects.effect import (
     Shape,
     Simulated,
 )
-from ident.effects.motion import ArmMotion, Floats, dahl
+from ident.effects.motion import ArmMotion, Floats, turned_friction
 from ident.effects.words import Values, quantity, quantity_text, times, wave
 
 
@@ -52,6 +52,7 @@ class PreslidingHysteresis(Effect):
     summary = "hysteresis around reversals"
     physics = "asperities bend before they slide, so friction turns over a distance after each reversal"
     source = "Dahl, AIAA Journal 14 (1976); Swevers et al., IEEE Trans. Autom. Control 45 (2000)"
+    remembers = False
     parameters = (
         Parameter("amplitude", "Nm", "Coulomb friction that turns over slowly", low=0.0),
         Parameter("length", "rad", "distance in which it turns by 63 %", shape=True, low=1e-5, high=0.5),
@@ -87,7 +88,7 @@ class PreslidingHysteresis(Effect):
 
         def turning(whole: ArmMotion) -> Floats:
             speed = whole.motor_speed[:, joint]
-            return np.asarray(dahl(np.cumsum(speed) * whole.dt, shape["length"], float(np.sign(speed[0]))))
+            return turned_friction(np.cumsum(speed) * whole.dt, shape["length"], float(speed[0]))
 
         state = motion.along(turning, "turning", joint, shape["length"])
         return (Column(motor=state - motion.direction[:, joint]),)

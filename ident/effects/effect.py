@@ -259,6 +259,7 @@ class Effect(ABC):
     law : the variable of its law, for the model-form error; None if unknown.
     whole_arm : the effect belongs to no single joint. event : it acts during a part of the time only, found by a
         search over times. step : it sets in at its `time` and stays. displaces : it turns the link under load.
+    remembers : its torque may follow from the motion more than seconds ago.
     channel : the torque channel it delays. counted : seen by counting samples, without a torque of its own.
     hidden : linear parameters equal to 1 by the physics, free in the search and not reported.
     character : every drive of the kind has it, so it is no fault by itself.
@@ -285,6 +286,7 @@ class Effect(ABC):
     law: ClassVar[Law | None] = None
     whole_arm: ClassVar[bool] = False
     event: ClassVar[bool] = False
+    remembers: ClassVar[bool] = True
     step: ClassVar[bool] = False
     displaces: ClassVar[bool] = False
     channel: ClassVar[Literal["motor", "joint"] | None] = None

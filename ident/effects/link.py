@@ -401,6 +401,7 @@ class BaseTilt(Effect):
     summary = "gravity is not along the assumed axis"
     physics = "the base is not level, so gravity is not along the assumed axis"
     source = "Khalil and Dombre, Modeling, Identification and Control of Robots (2002), chapter 12"
+    remembers = False
     parameters = (
         Parameter("tilt_x", "rad", "rotation of the base about its x axis", low=-0.5, high=0.5),
         Parameter("tilt_y", "rad", "rotation of the base about its y axis", low=-0.5, high=0.5),

@@ -24,6 +24,8 @@ _BY_SAMPLE = (
 )  # fmt: skip
 # Values along a whole motion remembered for its parts.
 _KEPT = 4
+# A drive at a tenth of this speed is at rest.
+_REST_RAD_S = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,6 +226,11 @@ def dahl(path, length, start):  # type: ignore[no-untyped-def]
             z = -1.0 + (1.0 + z) * np.exp(step / length)
         out[k] = z
     return out
+
+
+def turned_friction(path: Floats, length: float, speed: float) -> Floats:
+    """`dahl` along a path that begins with a speed [rad/s]: from a rest, with no friction to either side."""
+    return np.asarray(dahl(np.ascontiguousarray(path), length, float(np.tanh(speed / _REST_RAD_S))))
 
 
 @njit(cache=True, nogil=True)

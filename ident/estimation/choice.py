@@ -10,7 +10,8 @@ ten times the variance of the prior, gains of sensors that are beyond two standa
 squares in place of the prior. Of those that pay the one with the largest fall is taken first, and a looser prior that
 does not pay beside it is taken back: bodies free of the prior mimic a sensor's gain on the motion of the training,
 and on no other. A tilt beyond chance (p < 0.001 for an upright base) has to pay at all.
-An arm with gains is identified from the torques divided by them, and its model states them as effects.
+An arm with gains is identified from the torques divided by them, and its model states them as effects. So it does
+with friction of the drives that turns over a path after a reversal (`ident.estimation.turning`).
 
 Normal equations of each part are made once, so a linear candidate costs a solution a part, a physical one a conic
 program.
@@ -42,6 +43,7 @@ from ident.estimation.identify import (
 )
 from ident.estimation.mounting import Mounting, find_mounting, tilt_columns, with_tilt
 from ident.estimation.parts import beside, held_back_parts
+from ident.estimation.turning import Turning, friction_turning
 from ident.estimators.covariance import CovarianceSettings, effective_rows
 from ident.estimators.estimate import Estimate, chi_square_tail
 from ident.estimators.least_squares import WeightedLeastSquares
@@ -107,7 +109,8 @@ class Choice(Tabular):
     excluded : candidates that the data do not permit, with the reason. disagreement : between the URDF's inertials
     and the data. advice : sentences for the report. mounting : the tilt of the base, if the winner has one.
     gains : error of the joint torque sensor's scale by joint, value and standard deviation, if the winner has some.
-    used : the estimator taken instead of the winner; empty for the winner itself.
+    used : the estimator taken instead of the winner; empty for the winner itself. turning : of the drives' friction,
+    None where it turns at once.
     """
 
     candidates: tuple[Candidate, ...]
@@ -120,6 +123,7 @@ class Choice(Tabular):
     mounting: Mounting | None = None
     gains: dict[str, tuple[float, float]] = field(default_factory=dict)
     used: str = ""
+    turning: Turning | None = None
 
     @property
     def winner(self) -> Candidate:
@@ -148,6 +152,7 @@ class Choice(Tabular):
             "advice": list(self.advice),
             "mounting": None if self.mounting is None else self.mounting.to_dict(),
             "sensor_gains": {joint: {"error": e, "std": s} for joint, (e, s) in self.gains.items()},
+            "friction_turns": None if self.turning is None else self.turning.to_dict(),
         }
 
     def __repr__(self) -> str:
@@ -185,6 +190,8 @@ class Choice(Tabular):
                 f"  joint torque sensors read too much by: {listed}; the model states it as an effect, and "
                 "`lwr-run diagnose` tells a gain from its look-alikes"
             )
+        if self.turning is not None:
+            lines.append(f"  {self.turning}")
         return lines
 
 
@@ -228,10 +235,13 @@ def choose(
         found = identify(sessions, chain, final, known=first.known)
     else:
         found = rows.identified(final)
-    effects = tuple(
+    effects: tuple[Mapping[str, Any], ...] = tuple(
         entry_of(SENSOR_GAIN, [chain.joint_names.index(joint) + 1], {"error": gain})
         for joint, gain in choice.gains.items()
     )
+    turning = friction_turning(found.model, rows.sessions, recall=rows.recall)
+    if turning is not None:
+        choice, effects = replace(choice, turning=turning), (*effects, *turning.entries)
     apart = choice.disagreement
     warnings = (*found.warnings, str(apart)) if apart is not None and apart.strong else found.warnings
     return replace(found, settings=settled, choice=choice, effects=effects, warnings=warnings)

@@ -452,6 +452,6 @@ def _score_other(
             f"the model of {other.robot} computes the torque of the {theirs} side, the tested one that of the "
             f"{own} side, so they cannot compete; choose models with a side in common"
         )
-    prepared = prepared_session(other, session, settings, blocks=not other.effects)
+    prepared = prepared_session(other, session, settings, blocks=not other.remembers)
     predict = predictor(other, mounted(other, session))
     return score_session(prepared, predict, common, session, name)

@@ -363,8 +363,8 @@ def _residuals(passage: Passage, predict: Predictor, side: Side, settings: Signa
         torque = torque - resampled(joint.times, joint.torque, channel.times)
     error = torque - predict(channel, side)
     parallel = ParallelFilter(channel.times, passage.rows, settings.decimate, settings.attenuation_db)
-    inside = _inside(channel, passage)
-    used = inside[:, None] & ~flagged
+    within = inside(channel, passage)
+    used = within[:, None] & ~flagged
     moving = used & (np.abs(channel.qd) >= settings.standstill_rad_s)
     band = parallel.apply(error)
     if passage.core != (-np.inf, np.inf):
@@ -380,7 +380,7 @@ def resampled(times: Floats, values: Floats, wanted: Floats) -> Floats:
     return np.column_stack([np.interp(wanted, times, column) for column in values.T])
 
 
-def _inside(channel: TorqueChannel, passage: Passage) -> NDArray[np.bool_]:
+def inside(channel: TorqueChannel, passage: Passage) -> NDArray[np.bool_]:
     """Samples in the part of the passage with rows."""
     rows = passage.stretch_rows if len(passage.stretch_rows) else passage.rows
     step = float(np.median(np.diff(rows))) if len(rows) > 1 else 1.0

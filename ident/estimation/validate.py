@@ -186,8 +186,7 @@ def validate(
                 )
             predict = predictor(model, mounted(model, session))
             settle([doubt for doubt in doubts if doubt.certain and doubt.session in ("", session.path.name)])
-            # Effects may remember the motion before.
-            prepared = prepared_session(model, session, settings, blocks=not model.effects)
+            prepared = prepared_session(model, session, settings, blocks=not model.remembers)
             sides = model.structure.sides
             scores.append(score_session(prepared, predict, sides, session, "identified model", seen=flag))
         except LwrError as error:

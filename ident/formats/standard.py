@@ -14,6 +14,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, from_com
 from ident.dynamics.physical import Projection, project, reference_bodies
 from ident.dynamics.structure import Side
+from ident.effects import PRESLIDING
 from ident.model.dynamic_model import DynamicModel
 
 
@@ -121,9 +122,10 @@ def standard_model(
         vector[model.columns] = model.values
     if model.effects:
         named = ", ".join(str(effect["cause"]) for effect in model.effects)
+        notes = (*notes, f"Effects of the model missing in this file: {named}.")
+    if any(str(effect["cause"]) != PRESLIDING.cause for effect in model.effects):
         notes = (
             *notes,
-            f"Effects of the model missing in this file: {named}.",
             "The parameters were estimated together with these effects; without them, a model identified "
             "without effects predicts better.",
         )

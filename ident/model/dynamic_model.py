@@ -16,7 +16,7 @@ from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats
 from ident.dynamics.structure import Condition, ModelStructure, Side
 from ident.dynamics.tables import Tabular
-from ident.effects import check_entry, effects_torque
+from ident.effects import check_entry, effects_torque, find_effect
 from ident.effects.motion import ArmMotion
 
 Projection = Callable[["DynamicModel", Floats], Floats]
@@ -183,6 +183,11 @@ class DynamicModel(Tabular):
             bodies[-1] += vector[_LINK * link : _LINK * link + _BODY]
         return bodies
 
+    @property
+    def remembers(self) -> bool:
+        """Whether its torque may follow from the motion more than seconds ago."""
+        return any(find_effect(str(entry["cause"])).remembers for entry in self.effects)
+
     def drive(self) -> dict[str, Floats]:
         """Drive parameters by symbol (`Ia`, `Fvl`, ..., `offm`), each (n,)."""
         n = self.structure.chain.n
@@ -238,7 +243,7 @@ class DynamicModel(Tabular):
         stamps = time - time[0] if len(time) else time
 
         def friction(speed: Floats) -> Floats:
-            return drive["Fvm"] * speed + drive["Fcm"] * self.structure.coulomb(speed)
+            return drive["Fvm"] * speed + drive["Fcm"] * np.sign(speed)
 
         return ArmMotion(
             chain=chain,
@@ -258,6 +263,7 @@ class DynamicModel(Tabular):
             link_coulomb=drive["Fcl"],
             motor_coulomb=drive["Fcm"],
             friction=friction,
+            slip=self.structure.coulomb(qd),
         )
 
     def linear_torque(
