@@ -85,6 +85,40 @@ def swapped(channel: str, field: str, first: str, second: str) -> Change:
     return lambda sessions: _channel(sessions, channel, edit)
 
 
+def turned(degrees: float, *joints: str) -> Change:
+    """Positions with another zero."""
+
+    def edit(columns: JointColumns) -> JointColumns:
+        values = columns.position.copy()
+        values[:, [JOINTS.index(name) for name in joints]] += np.radians(degrees)
+        return replace(columns, position=values)
+
+    return lambda sessions: _channel(sessions, "joint", edit)
+
+
+def delayed(seconds: float, joint: str) -> Change:
+    """A joint's position from `seconds` before."""
+
+    def edit(columns: JointColumns) -> JointColumns:
+        values, k = columns.position.copy(), JOINTS.index(joint)
+        time = 1e-9 * (columns.log_time - columns.log_time[0])
+        values[:, k] = np.interp(time - seconds, time, values[:, k])
+        return replace(columns, position=values)
+
+    return lambda sessions: _channel(sessions, "joint", edit)
+
+
+def copied(channel: str, field: str, source: str, target: str) -> Change:
+    """The column of a joint read for another, too."""
+
+    def edit(columns: JointColumns) -> JointColumns:
+        values = getattr(columns, field).copy()
+        values[:, JOINTS.index(target)] = values[:, JOINTS.index(source)]
+        return replace(columns, **{field: values})
+
+    return lambda sessions: _channel(sessions, channel, edit)
+
+
 def clipped(channel: str, field: str, share: float, *joints: str) -> Change:
     """The joints' values held within a share of their largest."""
 
@@ -286,6 +320,12 @@ CASES: tuple[Case, ...] = (
     Case("joint A3 x 0.7", scaled(*L, 0.7, "A3"), (JOINT, "A3")),
     Case("joint A6 x 1.3", scaled(*L, 1.3, "A6"), (JOINT, "A6")),
     Case("position A3 x 1.3", scaled(*Q, 1.3, "A3"), (POSITION, "A3")),
+    Case("position A2 x 1.15", scaled(*Q, 1.15, "A2"), (POSITION, "A2")),
+    Case("position E1 5 deg off", turned(5.0, "E1"), (POSITION, "E1")),
+    Case("position A4 15 deg off", turned(15.0, "A4"), (POSITION, "A4")),
+    Case("position A2 40 ms late", delayed(0.04, "A2"), (POSITION, "A2")),
+    Case("position E1 read for A4, too", copied(*Q, "E1", "A4"), (POSITION, "E1", "A4")),
+    Case("joint E1 read for A4, too", copied(*L, "E1", "A4"), (JOINT, "E1", "A4")),
     # Saturation and dead sensors.
     Case("joint A2 saturated", clipped(*L, 0.7, "A2"), (JOINT, "A2")),
     Case("joint A5 saturated", clipped(*L, 0.5, "A5"), (JOINT, "A5")),

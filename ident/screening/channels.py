@@ -231,20 +231,38 @@ def _dead(sessions: Sequence[Session]) -> Iterator[Doubt]:
 
 
 def _copied(session: Session) -> Iterator[Doubt]:
-    """Torques of several joints equal to the last bit in every sample, as two sensors never are."""
+    """Torques or positions of several joints equal to the last bit in every sample, as two sensors never are. Positions
+    of a simulation may be, if its motion asks for them, or if all joints go the same way."""
     for channel, columns in _torques(session):
-        silent = set(dead(columns))
-        alike: dict[bytes, list[int]] = {}
-        for joint in range(columns.effort.shape[1]):
-            if joint not in silent:
-                alike.setdefault(content(column(columns.effort, joint)), []).append(joint)
-        for joints in alike.values():
-            if len(joints) > 1:
-                names = tuple(session.joint_names[joint] for joint in joints)
-                seen = "read the same to the last bit in every sample"
-                looks = "one column taken for several joints"
-                mend = "give each joint its own column when importing"
-                yield Doubt(channel, names, seen, looks, mend, True, session.path.name)
+        for joints in _alike(columns.effort):
+            yield _copies(session, channel, joints, certain=True)
+    for joints in _alike(session.joint.position):
+        if len(joints) == session.joint.position.shape[1]:
+            continue
+        command = session.command
+        names = [session.joint_names[joint] for joint in joints]
+        known = command is not None and bool(command.position.shape[1]) and set(names) <= set(command.names)
+        if command is None or not known:
+            yield _copies(session, "position", joints, certain=False)
+        elif len(_alike(command.position[:, [command.names.index(name) for name in names]])) != 1:
+            yield _copies(session, "position", joints, certain=True)
+
+
+def _alike(values: Floats) -> list[list[int]]:
+    """Groups of columns that change and are equal."""
+    groups: dict[bytes, list[int]] = {}
+    for joint in range(values.shape[1]):
+        own = column(values, joint)
+        if np.ptp(own) > 0.0:
+            groups.setdefault(content(own), []).append(joint)
+    return [joints for joints in groups.values() if len(joints) > 1]
+
+
+def _copies(session: Session, channel: str, joints: Sequence[int], *, certain: bool) -> Doubt:
+    names = tuple(session.joint_names[joint] for joint in joints)
+    seen = "read the same to the last bit in every sample"
+    looks, mend = "one column taken for several joints", "give each joint its own column when importing"
+    return Doubt(channel, names, seen, looks, mend, certain, session.path.name)
 
 
 def _frozen(session: Session) -> Iterator[Doubt]:

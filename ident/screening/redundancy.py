@@ -24,7 +24,7 @@ from scipy.linalg.lapack import dpotrs, dpstrf
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, Floats
-from ident.dynamics.regressor import rigid_regressor
+from ident.dynamics.regressor import rigid_regressor, torque
 from ident.dynamics.structure import Coupling
 from ident.rows.content import Recall
 from ident.rows.filters import ParallelFilter, SignalSettings, block_means, thinning
@@ -43,6 +43,8 @@ FLOOR = 0.01
 _ROUNDS = 8
 # Square of the sine between a column and those before it, below which it is dependent.
 _DEPENDENT = 1e-9
+# Norm of a column over the largest, below which it is nothing but rounding.
+_NOTHING = 1e-10
 # Rows with a common error: two seconds at the usual rate.
 _BLOCK = 10
 _MOST_ROWS = 800
@@ -384,6 +386,40 @@ class Redundancy:
             )
         return result
 
+    def along(self, fit: Fit, normal: Normal, columns: Sequence[Floats]) -> tuple[float, float]:
+        """Size of an error beside all parameters, and its standard deviation by blocks of rows.
+
+        columns : (n, K) of each set of rows, what the error by one adds to the computed torques [Nm].
+        """
+        shared = np.zeros_like(fit.parameters)
+        matrices = [self.matrix(rows) for rows in self.rows]
+        weights = [[fit.weight.get((rows.side, j), 0.0) for j in range(self.chain.n)] for rows in self.rows]
+        for matrix, column, weight in zip(matrices, columns, weights, strict=True):
+            shared += sum(w * (c @ own) for own, c, w in zip(matrix, column, weight, strict=True))
+        others = _solve(normal.total(fit.weight), shared)
+        den = num = spread = 0.0
+        parts = []
+        for rows, matrix, column, weight in zip(self.rows, matrices, columns, weights, strict=True):
+            error = self.map_of(rows.side) @ rows.torque.T - matrix @ fit.parameters
+            rest, own = column - matrix @ others, np.array(weight)[:, None]
+            den += float(np.sum(own * rest**2))
+            num += float(np.sum(own * rest * error))
+            parts.append((rest, error, own))
+        size = num / max(den, 1e-300)
+        for rest, error, own in parts:
+            product = np.sum(own * rest * (error - size * rest), axis=0)
+            spread += float(np.sum(np.add.reduceat(product, np.arange(0, len(product), _BLOCK)) ** 2))
+        return size, float(np.sqrt(spread)) / max(den, 1e-300)
+
+    def rigid(self, rows: SampledRows, fit: Fit) -> Floats:
+        """Torque (n, K) [Nm] of the bodies of a fit."""
+        n = self.chain.n
+        bodies = fit.parameters[: _BODY * n].reshape(n, _BODY).copy()
+        if rows.payload is not None:
+            start = _BODY * (n + self.payloads.index(rows.payload))
+            bodies[-1] += fit.parameters[start : start + _BODY]
+        return np.asarray(torque(self.chain, rows.q, rows.qd, rows.qdd, bodies).T)
+
     def deviation(self, fit: Fit, normal: Normal, directions: Floats) -> Floats:
         """Standard deviation (m,) of the combinations `directions` (m, p) of the parameters, by blocks of rows."""
         total = normal.total(fit.weight)
@@ -403,7 +439,7 @@ class Redundancy:
 def _solve(matrix: Floats, right: Floats) -> Floats:
     """Solution of the normal equations in the excited columns (Cholesky with pivots), zero in the others."""
     scale = np.sqrt(np.diag(matrix))
-    scale = np.where(scale > 1e-150, scale, np.inf)
+    scale = np.where(scale > max(_NOTHING * np.max(scale, initial=0.0), 1e-150), scale, np.inf)
     # Column-major as LAPACK has it; the matrix is symmetric.
     factor, order, rank, _ = dpstrf((matrix / (scale[:, None] * scale)).T, tol=_DEPENDENT, overwrite_a=1)
     kept = order[:rank] - 1

@@ -30,6 +30,7 @@ from ident.rows.sessions import payload_name
 from ident.screening.channels import check_channels, check_limits, dead
 from ident.screening.doubts import Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, explain, is_wrong, unit_of
+from ident.screening.positions import position_errors
 from ident.screening.redundancy import Class, Fit, Normal, Redundancy
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -177,7 +178,26 @@ def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> list[Doubt
         found = [_doubt(one, sessions) for one in explanations]
         normal = data.normal()
         fit = data.fit(normal)
-    return found + _physics(data, fit, normal) or _of_motors(data)
+    found += _physics(data, fit, normal)
+    return found or _positions(data, fit, normal) or _of_motors(data)
+
+
+def _positions(data: Redundancy, fit: Fit, normal: Normal) -> list[Doubt]:
+    """Small errors of positions; no certain ones, for drawing and arm may differ as well."""
+    names = data.chain.joint_names
+    return [
+        Doubt(
+            "position",
+            (names[one.joint],),
+            "contradicts the torques of the other joints; the residuals of all torques together fall by a factor of "
+            f"{np.exp(one.drop):.3g} with it undone",
+            one.looks_like,
+            "check zero and gain of this channel (`offset_rad` and `scale` in the mapping of the import) and the "
+            "joint's frame in the URDF",
+            False,
+        )
+        for one in position_errors(data, fit, normal)
+    ]
 
 
 def _of_the_wrong_side(one: Explanation) -> Explanation:

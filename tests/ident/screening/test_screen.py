@@ -22,10 +22,13 @@ from benchmarks.wrong_channels import (
 )
 from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
+from ident.rows.content import Recall
+from ident.rows.filters import SignalSettings
 from ident.screening.channels import check_channels
 from ident.screening.doubts import Doubt, settle
 from ident.screening.explanations import unit_of
-from ident.screening.screen import require_sound, screen, without_dead
+from ident.screening.positions import position_errors
+from ident.screening.screen import _rows, require_sound, screen, without_dead
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session
 
@@ -191,6 +194,67 @@ def test_a_torque_that_is_a_copy_of_another_joints_is_an_error(pair: list[Sessio
     effort[:, [2, 4]] = 0.0
     silent = check_channels([replace(pair[1], **{side: replace(columns, effort=effort)})], chain())
     assert {doubt.looks_like for doubt in silent} == {"a dead sensor"}
+
+
+def test_positions_that_are_a_copy_of_another_joints_are_told(pair: list[Session]) -> None:
+    columns = pair[1].joint
+    position = columns.position.copy()
+    position[:, 4] = position[:, 2]
+    copied = replace(pair[1], joint=replace(columns, position=position))
+    (found,) = [d for d in check_channels([pair[0], copied], chain()) if "column" in d.looks_like]
+    assert (found.channel, found.joints, found.session) == ("position", ("E1", "A4"), "loaded.mcap")
+    # The commands ask for different motions; without commands a simulation may have them alike.
+    assert found.certain
+    (found,) = [
+        d for d in check_channels([replace(copied, command=None)], chain()) if "column" in d.looks_like
+    ]
+    assert not found.certain
+    command = pair[1].command
+    assert command is not None
+    asked = command.position.copy()
+    asked[:, 4] = asked[:, 2]
+    same = replace(copied, command=replace(command, position=asked))
+    assert not [d for d in check_channels([same], chain()) if "column" in d.looks_like]
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "size"),
+    [
+        ("E1", "offset", np.radians(5.0)),
+        ("A3", "offset", np.radians(-6.0)),
+        ("A2", "gain", 0.15),
+        ("A4", "gain", -0.15),
+        ("A2", "delay", 0.04),
+    ],
+)
+def test_a_position_with_a_small_error_is_told_with_its_size(
+    pair: list[Session], name: str, kind: str, size: float
+) -> None:
+    place = chain().joint_names.index(name)
+
+    def edited(session: Session) -> Session:
+        position = session.joint.position.copy()
+        own = position[:, place]
+        if kind == "delay":
+            time = np.arange(len(own)) * session.joint.period_s
+            position[:, place] = np.interp(time - size, time, own)
+        else:
+            position[:, place] = own + size if kind == "offset" else (1.0 + size) * own
+        return replace(session, joint=replace(session.joint, position=position))
+
+    data = _rows([edited(session) for session in pair], chain(), SignalSettings(), (), Recall())
+    assert data is not None
+    normal = data.normal()
+    (found,) = position_errors(data, data.fit(normal), normal)
+    assert (chain().joint_names[found.joint], found.kind) == (name, kind)
+    assert found.size == pytest.approx(size, abs=max(0.2 * abs(size), 3.0 * found.std))
+
+
+def test_positions_of_a_healthy_arm_have_no_small_error(pair: list[Session]) -> None:
+    data = _rows(pair, chain(), SignalSettings(), (), Recall())
+    assert data is not None
+    normal = data.normal()
+    assert position_errors(data, data.fit(normal), normal) == []
 
 
 @pytest.mark.parametrize(
