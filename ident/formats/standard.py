@@ -121,8 +121,7 @@ def standard_model(
         vector = np.zeros(structure.n_columns)
         vector[model.columns] = model.values
     if model.effects:
-        named = ", ".join(str(effect["cause"]) for effect in model.effects)
-        notes = (*notes, f"Effects of the model missing in this file: {named}.")
+        notes = (*notes, f"Effects of the model missing in this file: {_named(model)}.")
     if any(str(effect["cause"]) != PRESLIDING.cause for effect in model.effects):
         notes = (
             *notes,
@@ -230,6 +229,15 @@ def _torque_change(model: DynamicModel, vector: Floats) -> Floats:
         error = (matrix @ (vector - model.standard)).reshape(structure.chain.n, -1)
         total += np.mean(error**2, axis=1)
     return np.sqrt(total / (1 + len(structure.payloads)))
+
+
+def _named(model: DynamicModel) -> str:
+    """The effects of a model with their joints."""
+    joints: dict[str, list[str]] = {}
+    for effect in model.effects:
+        names = [model.structure.chain.joint_names[int(joint) - 1] for joint in effect["joints"]]
+        joints.setdefault(str(effect["cause"]), []).extend(names)
+    return ", ".join(cause + (f" ({', '.join(own)})" if own else "") for cause, own in joints.items())
 
 
 def _couplings(model: DynamicModel, vector: Floats) -> tuple[CoupledDrives, ...]:

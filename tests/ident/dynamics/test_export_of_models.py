@@ -137,4 +137,4 @@ def test_effects_that_are_left_out_are_named(truth_model: DynamicModel) -> None:
             },
         ),
     )
-    assert "Effects of the model missing in this file: stribeck." in to_numpy(standard_model(extended))
+    assert "Effects of the model missing in this file: stribeck (A2)." in to_numpy(standard_model(extended))

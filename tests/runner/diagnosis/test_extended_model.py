@@ -146,7 +146,7 @@ def test_every_exporter_says_what_it_cannot_carry(healthy: DynamicModel) -> None
     plain, bodies = standard_model(extended), standard_model(extended, consistent=True)
     for text in (to_numpy(plain), to_c(plain, "arm"), to_urdf(bodies), to_mjcf(bodies, name="arm")):
         words = " ".join(text.replace("*", " ").replace("#", " ").split())
-        assert "Effects of the model missing in this file: cable_spring, stribeck." in words
+        assert "Effects of the model missing in this file: cable_spring (A3), stribeck (A2)." in words
 
 
 def test_parameters_of_effects_keep_their_intervals_in_the_file(
