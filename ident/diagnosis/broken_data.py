@@ -19,6 +19,7 @@ from fri.errors import LwrError
 from ident.diagnosis.recording import SessionRecord
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling
+from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
 from ident.screening.channels import asked_to_move
 from ident.screening.doubts import Doubt, settle
@@ -55,11 +56,16 @@ def broken_channels(
     chain: Chain,
     signals: SignalSettings,
     couplings: Sequence[Coupling] = (),
+    *,
+    recall: Recall | None = None,
 ) -> tuple[BrokenChannel, ...]:
-    """The channels of the sessions that `ident.screening` is certain about, and dead ones."""
+    """The channels of the sessions that `ident.screening` is certain about, and dead ones.
+
+    recall : as for `prepare`.
+    """
     found = []
     chosen = [session.select(chain.joint_names) for session in sessions]
-    for doubt in screen(chosen, chain, signals, couplings):
+    for doubt in screen(chosen, chain, signals, couplings, recall=recall):
         if (doubt.certain or doubt.lost) and not _stands(doubt, chosen):
             what = f"{doubt.seen}, looks like {doubt.looks_like}" if doubt.looks_like else doubt.seen
             joints: list[int | None] = [chain.joint_names.index(name) + 1 for name in doubt.joints]

@@ -37,6 +37,7 @@ from ident.dynamics.kinematics import Chain
 from ident.effects.motion import dahl
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
+from ident.rows.content import Recall
 from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -220,9 +221,10 @@ def commission(
     settings = settled(settings, parts[0], chain)
     recorded: list[list[SessionRecord]] = []
     for part in parts:
-        broken = broken_channels(part, chain, settings.signals, () if arm is None else arm.couplings)
+        couplings, recall = () if arm is None else arm.couplings, Recall()
+        broken = broken_channels(part, chain, settings.signals, couplings, recall=recall)
         refuse([one for one in broken if not one.lost], chain.joint_names)
-        records = [record(s, k, chain, settings) for k, s in enumerate(part)]
+        records = [record(s, k, chain, settings, recall=recall) for k, s in enumerate(part)]
         recorded.append(list(without_broken(records, broken)))
         every_joint_moves(recorded[-1], chain)
     first = recorded[0]

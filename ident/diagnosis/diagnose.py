@@ -41,6 +41,7 @@ from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, PRESLIDING, Shape
 from ident.model import Model, as_model
 from ident.model.signals import signal_settings
+from ident.rows.content import Recall
 from ident.rows.sessions import require
 from lwr_driver.session import Sessions, as_sessions
 
@@ -89,12 +90,14 @@ def diagnose(
     held = {id(s) for s in test}
     known = None if reference is None else signal_settings(reference.model)
     settings = settings if known is None else replace(settings, signals=known)
-    broken = broken_channels(everything, chain, settings.signals, () if arm is None else arm.couplings)
+    couplings, recall = () if arm is None else arm.couplings, Recall()
+    broken = broken_channels(everything, chain, settings.signals, couplings, recall=recall)
     with blamed(broken, chain.joint_names):
-        settings = settled(settings, sessions, chain)
+        settings = settled(settings, sessions, chain, recall=recall)
         recordings = tuple(
-            record(s, k, chain, settings, test=id(s) in held) for k, s in enumerate(everything)
+            record(s, k, chain, settings, test=id(s) in held, recall=recall) for k, s in enumerate(everything)
         )
+        del recall
         some_joint_moves(recordings)
         recordings = without_broken(recordings, broken)
         nominal = nominal_arm(chain, arm, reference)

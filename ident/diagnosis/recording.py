@@ -14,6 +14,7 @@ from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import ModelStructure, Side
+from ident.rows.content import Recall
 from ident.rows.data_quality import Stuck, clipped_at, passed_band, stuck_at
 from ident.rows.prepare import prepare
 from ident.rows.prepared import PreparedSession
@@ -106,8 +107,11 @@ class SessionRecord:
         return (*motor, "joint") if self.has_effort else motor
 
 
-def settled(settings: DiagnosisSettings, sessions: Sequence[Session], chain: Chain) -> DiagnosisSettings:
-    """The settings with signals and friction law from the fitted sessions, as `identify` chooses them."""
+def settled(
+    settings: DiagnosisSettings, sessions: Sequence[Session], chain: Chain, *, recall: Recall | None = None
+) -> DiagnosisSettings:
+    """The settings with signals and friction law from the fitted sessions, as `identify` chooses them. recall : as for
+    `prepare`."""
     chosen = [session.select(chain.joint_names) for session in sessions]
     payloads = [payload_name(session) for session in chosen]
     sensed = any(bool(session.joint.effort.shape[1]) for session in chosen)
@@ -121,7 +125,9 @@ def settled(settings: DiagnosisSettings, sessions: Sequence[Session], chain: Cha
     try:
         base = numeric_base(structure)
         laws = (settings.law, None)
-        found = choose_signals(chosen, payloads, structure, base.columns, settings.signals, laws)
+        found = choose_signals(
+            chosen, payloads, structure, base.columns, settings.signals, laws, recall=recall
+        )
     except DataError as error:
         # The records say what is wrong with a session.
         logger.info("signal settings of the paper, because: %s", error)
@@ -130,12 +136,18 @@ def settled(settings: DiagnosisSettings, sessions: Sequence[Session], chain: Cha
 
 
 def record(
-    session: Session, number: int, chain: Chain, settings: DiagnosisSettings, *, test: bool = False
+    session: Session,
+    number: int,
+    chain: Chain,
+    settings: DiagnosisSettings,
+    *,
+    test: bool = False,
+    recall: Recall | None = None,
 ) -> SessionRecord:
-    """Filter one session. Raises DataError for sessions without a stretch long enough."""
+    """Filter one session. recall : as for `prepare`. Raises DataError for sessions without a stretch long enough."""
     chosen = session.select(chain.joint_names)
     rate = 1.0 / chosen.joint.period_s
-    prepared = prepare(chosen, replace(settings.signals, motor_delay_s=0.0))
+    prepared = prepare(chosen, replace(settings.signals, motor_delay_s=0.0), recall=recall)
     motor = chosen.motor
     stuck = () if motor is None else stuck_at(motor, chosen.joint)
     stretches = tuple(_stretches(prepared, rate, stuck))
