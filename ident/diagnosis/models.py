@@ -23,6 +23,7 @@ from ident.diagnosis.selection import Selection
 from ident.diagnosis.task import Baseline, ModelFit, State, Task
 from ident.diagnosis.tolerances import COMPLIANCE, GAIN, LENGTH
 from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of, parameter_values
+from ident.estimation.turning import drive_coulomb
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 
@@ -110,11 +111,10 @@ def turning_friction(
     """Entries of the drives' friction that turns over the arm's presliding lengths of these days, but for what `found`
     says of it."""
     nominal = bench.nominal
-    arm, drive = nominal.arm, model.drive()
+    arm = nominal.arm
     if arm.presliding is None or "motor" not in nominal.rows:
         return []
-    # Without joint torques friction of link and drive is one.
-    level = drive["Fcm"] if "joint" in nominal.rows else drive["Fcm"] + drive["Fcl"]
+    level = drive_coulomb(model, sensed="joint" in nominal.rows)
     entries = []
     for joint in np.flatnonzero(arm.presliding > 0.0).tolist():
         taken = sum(

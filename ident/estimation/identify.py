@@ -101,8 +101,8 @@ class Identification(Tabular):
     base : the base parameters and their regrouping. estimate : values, covariance and residuals.
     prepared : the filtered sessions, without their samples. problem : the stacked regression.
     warnings : sentences for the report. choice : of the estimator, with "auto". known : of the sessions, for a further
-    identification of them. effects : of the model beside its parameters (sensor gains). marks : of the rows of each
-    session, by which a copy is known (`ident.rows.shared_rows`).
+    identification of them. effects : of the model beside its parameters (sensor gains, turning friction). marks : of
+    the rows of each session, by which a copy is known (`ident.rows.shared_rows`).
     """
 
     settings: IdentificationSettings

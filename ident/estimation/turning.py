@@ -85,7 +85,7 @@ def friction_turning(
     whole = _Sums.joined(sums) if sums else None
     if whole is None or len(whole.error) < _LEAST_BLOCKS:
         return None
-    coulomb = _coulomb(model, sensed=any(bool(s.joint.effort.shape[1]) for s in sessions))
+    coulomb = drive_coulomb(model, sensed=any(bool(s.joint.effort.shape[1]) for s in sessions))
     entries, names = [], []
     left = whole.error.sum(axis=0)
     for joint, name in enumerate(model.structure.chain.joint_names):
@@ -106,7 +106,7 @@ def friction_turning(
     return Turning(tuple(entries), before, after, tuple(names))
 
 
-def _coulomb(model: DynamicModel, *, sensed: bool) -> Floats:
+def drive_coulomb(model: DynamicModel, *, sensed: bool) -> Floats:
     """Coulomb friction (n,) [Nm] of the drives. Without joint torques, friction of link and drive is one."""
     drive = model.drive()
     return drive["Fcm"] if sensed else drive["Fcm"] + drive["Fcl"]
