@@ -219,9 +219,10 @@ def commission(
     start = replace(nominal_arm(chain, arm, None), encoder_known=True)
     sides: tuple[Side, ...] = ("link", "motor") if np.any(start.compliance > 0.0) else ("link",)
     settings = settled(settings, parts[0], chain)
+    couplings = () if arm is None else arm.couplings
     recorded: list[list[SessionRecord]] = []
     for part in parts:
-        couplings, recall = () if arm is None else arm.couplings, Recall()
+        recall = Recall()
         broken = broken_channels(part, chain, settings.signals, couplings, recall=recall)
         refuse([one for one in broken if not one.lost], chain.joint_names)
         records = [record(s, k, chain, settings, recall=recall) for k, s in enumerate(part)]

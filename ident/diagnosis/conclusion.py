@@ -11,13 +11,7 @@ from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, doubted
 from ident.diagnosis.evidence import Floats
-from ident.diagnosis.extension import (
-    Member,
-    extension,
-    power_left,
-    title,
-    torque_error,
-)
+from ident.diagnosis.extension import Member, extension, power_left, title, torque_error
 from ident.diagnosis.findings import loss_finding
 from ident.diagnosis.held_out import held_out
 from ident.diagnosis.models import changes_of, fitted_models, lasting, without_harm
@@ -54,8 +48,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
     if task.reference is not None:
         shown = held_out(evidence, [*(one.claim.trial.rows for one in kept), *nuisance])
         # Without the reference's prior, gains of the sensors and drive inertias compensate each other.
-        named = zip(state.selection.nuisance, nuisance, strict=True)
-        tolerated = [rows for name, rows in named if not name.startswith(GAIN)]
+        tolerated = [rows for name, rows in state.selection.tolerated.items() if not name.startswith(GAIN)]
         claimed = [one.claim.trial.rows for one in kept]
         worn = wear(bench, task.reference, shown, claimed, tolerated, remainders)
     members = [

@@ -160,12 +160,11 @@ def _in_time(task: Task, state: State) -> State:
         late = _late(state.selection)
     if not late:
         return replace(state, left_out=tuple(doubtful))
-    named = zip(state.selection.nuisance, state.selection.nuisance_rows, strict=True)
-    baseline = Baseline.of(
-        state.bench,
-        [rows for name, rows in named if "delay" not in name],
-        {name: rows for name, rows in lasting(state.selection).items() if "delay" not in name},
+    tolerated, beside = (
+        {name: rows for name, rows in found.items() if "delay" not in name}
+        for found in (state.selection.tolerated, lasting(state.selection))
     )
+    baseline = Baseline.of(state.bench, list(tolerated.values()), beside)
     shifted, bench, amounts = task.arm, state.bench, {c.trial.candidate.cause: _made(c) for c in late}
     healthy = _at_another_phase(task.reference) if DELAYS["motor"].cause in amounts else task.reference
     for _ in range(_SHIFTS):
@@ -226,8 +225,7 @@ def _rest(bench: DiagnosisBench, selection: Selection, cause: str) -> tuple[floa
     side = EFFECTS[cause].channel
     alike = (cause, PRESLIDING.cause)
     taken = [c.trial.rows for c in selection.claims if c.trial.candidate.cause not in alike]
-    named = zip(selection.nuisance, selection.nuisance_rows, strict=True)
-    tolerated = [rows for name, rows in named if not name.startswith(f"{side} delay")]
+    tolerated = [rows for name, rows in selection.tolerated.items() if not name.startswith(f"{side} delay")]
     bench.evidence.replace([*taken, *tolerated])
     columns = bench.dictionary.rows(Candidate(EFFECTS[cause], -1), Shape(delay=_UNIT_S))
     return _delay_of(bench.evidence.score(bench.evidence.padded(columns)))

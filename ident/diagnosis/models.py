@@ -37,7 +37,8 @@ def lasting(selection: Selection) -> dict[str, Rows]:
     """The tolerated deviations that stay beside the columns of a model: delays and stiffness, which are no torques,
     and the gains of the torque sensors that are clear of zero, which the models predict as these sensors show them."""
     found = {}
-    for (name, (value, std)), rows in zip(selection.nuisance.items(), selection.nuisance_rows, strict=True):
+    for name, rows in selection.tolerated.items():
+        value, std = selection.nuisance[name]
         clear = abs(value) > max(_CLEAR * std, _MATTERS * GAIN_STD)
         if "delay" in name or name.startswith(COMPLIANCE) or (name.startswith(GAIN) and clear):
             found[name] = rows
@@ -81,8 +82,9 @@ def fitted_models(
         replace(nominal.base, structure=structure),
         provenance,
     )
-    fit = ModelFit.of(evidence, [rows for m in members for rows in m.rows], lasting(selection))
-    evidence.replace([*(rows for m in members for rows in m.rows), *selection.nuisance_rows])
+    own = [rows for m in members for rows in m.rows]
+    fit = ModelFit.of(evidence, own, lasting(selection))
+    evidence.replace([*own, *selection.nuisance_rows])
     extended = replace(base, values=fit.values, covariance=fit.covariance)
     return Models(
         _with_effects(base, bench, selection, baseline.fit, ()),

@@ -83,6 +83,11 @@ class Selection:
     scores: dict[tuple[str, int], float]
     nuisance_rows: list[Rows] = field(default_factory=list)
 
+    @property
+    def tolerated(self) -> dict[str, Rows]:
+        """Rows of the tolerated deviations by name."""
+        return dict(zip(self.nuisance, self.nuisance_rows, strict=True))
+
 
 def select(
     dictionary: Dictionary,

@@ -124,7 +124,9 @@ def _channels(
         prepared = prepare(session, settings, log=False, advise=False, blocks=True, recall=recall)
         seen = 0.0
         for passage in prepared.passages:
-            if passage.motor is not None and len(passage.rows) and seen < share:
+            if seen >= share:
+                break
+            if passage.motor is not None and len(passage.rows):
                 channel = passage.motor
                 yield channel, inside(channel, passage)[:, None] & ~channel.flagged, payload_name(session)
                 seen += float(np.ptp(channel.times))

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ident.dynamics.parameters import Floats
 from ident.screening.redundancy import Fit, Normal, Redundancy, SampledRows
 
 _DEVIATIONS = 6.0
@@ -64,24 +65,30 @@ def position_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[Position
     found = []
     before = [data.rigid(rows, fit) for rows in data.rows]
     # In motor torques alone, friction that follows no simple law looks like late positions.
-    kinds = {kind: known for kind, known in KINDS.items() if kind != "delay" or "joint" in data.sides}
-    for joint in range(data.chain.n):
-        for kind, known in kinds.items():
-            if kind == "offset" and data.chain.prismatic[joint]:
-                continue
-            columns = [
-                (data.rigid(changed(rows, joint, kind, _STEP), fit) - torque) / _STEP
-                for rows, torque in zip(data.rows, before, strict=True)
-            ]
-            size, std = data.along(fit, normal, columns)
-            # Beyond one the column says nothing.
-            if not max(known.least, _DEVIATIONS * std) < abs(size) < 1.0:
-                continue
-            rows = tuple(changed(part, joint, kind, size) for part in data.rows)
-            drop = fit.score - replace(data, rows=rows).fit(doubtful=False).score
-            if drop > known.drop:
-                recorded = {"offset": -size, "gain": 1.0 / (1.0 + size) - 1.0}.get(kind, size)
-                found.append(PositionError(joint, kind, recorded, std, drop))
+    asked = [
+        (joint, kind)
+        for joint in range(data.chain.n)
+        for kind in KINDS
+        if ("joint" in data.sides or kind != "delay")
+        and not (data.chain.prismatic[joint] and kind == "offset")
+    ]
+
+    def columns(joint: int, kind: str) -> list[Floats]:
+        return [
+            (data.rigid(changed(rows, joint, kind, _STEP), fit) - torque) / _STEP
+            for rows, torque in zip(data.rows, before, strict=True)
+        ]
+
+    sizes = data.along(fit, normal, (columns(*one) for one in asked))
+    for (joint, kind), (size, std) in zip(asked, sizes, strict=True):
+        # Beyond one the column says nothing.
+        if not max(KINDS[kind].least, _DEVIATIONS * std) < abs(size) < 1.0:
+            continue
+        rows = tuple(changed(part, joint, kind, size) for part in data.rows)
+        drop = fit.score - replace(data, rows=rows).fit(doubtful=False).score
+        if drop > KINDS[kind].drop:
+            recorded = {"offset": -size, "gain": 1.0 / (1.0 + size) - 1.0}.get(kind, size)
+            found.append(PositionError(joint, kind, recorded, std, drop))
     return sorted(found, key=lambda one: -one.drop)[:1]
 
 

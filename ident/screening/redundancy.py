@@ -14,7 +14,7 @@ torque; the sum of log rho over the classes ranks explanations.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -386,30 +386,38 @@ class Redundancy:
             )
         return result
 
-    def along(self, fit: Fit, normal: Normal, columns: Sequence[Floats]) -> tuple[float, float]:
-        """Size of an error beside all parameters, and its standard deviation by blocks of rows.
+    def along(
+        self, fit: Fit, normal: Normal, errors: Iterable[Sequence[Floats]]
+    ) -> Iterator[tuple[float, float]]:
+        """Size of each error beside all parameters, and its standard deviation by blocks of rows.
 
-        columns : (n, K) of each set of rows, what the error by one adds to the computed torques [Nm].
+        errors : of each the columns (n, K) for all sets of rows, what an error by one adds to the computed torques
+            [Nm].
         """
-        shared = np.zeros_like(fit.parameters)
-        matrices = [self.matrix(rows) for rows in self.rows]
-        weights = [[fit.weight.get((rows.side, j), 0.0) for j in range(self.chain.n)] for rows in self.rows]
-        for matrix, column, weight in zip(matrices, columns, weights, strict=True):
-            shared += sum(w * (c @ own) for own, c, w in zip(matrix, column, weight, strict=True))
-        others = _solve(normal.total(fit.weight), shared)
-        den = num = spread = 0.0
-        parts = []
-        for rows, matrix, column, weight in zip(self.rows, matrices, columns, weights, strict=True):
-            error = self.map_of(rows.side) @ rows.torque.T - matrix @ fit.parameters
-            rest, own = column - matrix @ others, np.array(weight)[:, None]
-            den += float(np.sum(own * rest**2))
-            num += float(np.sum(own * rest * error))
-            parts.append((rest, error, own))
-        size = num / max(den, 1e-300)
-        for rest, error, own in parts:
-            product = np.sum(own * rest * (error - size * rest), axis=0)
-            spread += float(np.sum(np.add.reduceat(product, np.arange(0, len(product), _BLOCK)) ** 2))
-        return size, float(np.sqrt(spread)) / max(den, 1e-300)
+        total = normal.total(fit.weight)
+        table = []
+        for rows in self.rows:
+            matrix = self.matrix(rows)
+            weight = np.array([fit.weight.get((rows.side, j), 0.0) for j in range(self.chain.n)])
+            left = self.map_of(rows.side) @ rows.torque.T - matrix @ fit.parameters
+            table.append((matrix, weight, left))
+        for columns in errors:
+            shared = np.zeros_like(fit.parameters)
+            for (matrix, weight, _), column in zip(table, columns, strict=True):
+                shared += sum(w * (c @ own) for own, c, w in zip(matrix, column, weight, strict=True))
+            others = _solve(total, shared)
+            rests = [column - matrix @ others for (matrix, *_), column in zip(table, columns, strict=True)]
+            parts = [
+                (rest, weight[:, None] * rest, left)
+                for rest, (_, weight, left) in zip(rests, table, strict=True)
+            ]
+            den = max(sum(float(np.sum(weighted * rest)) for rest, weighted, _ in parts), 1e-300)
+            size = sum(float(np.sum(weighted * left)) for _, weighted, left in parts) / den
+            spread = 0.0
+            for rest, weighted, left in parts:
+                product = np.sum(weighted * (left - size * rest), axis=0)
+                spread += float(np.sum(np.add.reduceat(product, np.arange(0, len(product), _BLOCK)) ** 2))
+            yield size, float(np.sqrt(spread)) / den
 
     def rigid(self, rows: SampledRows, fit: Fit) -> Floats:
         """Torque (n, K) [Nm] of the bodies of a fit."""
