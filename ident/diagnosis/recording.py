@@ -147,7 +147,7 @@ def record(
     """Filter one session. recall : as for `prepare`. Raises DataError for sessions without a stretch long enough."""
     chosen = session.select(chain.joint_names)
     rate = 1.0 / chosen.joint.period_s
-    prepared = prepare(chosen, replace(settings.signals, motor_delay_s=0.0), recall=recall)
+    prepared = prepare(chosen, settings.signals.punctual, recall=recall)
     motor = chosen.motor
     stuck = () if motor is None else stuck_at(motor, chosen.joint)
     stretches = tuple(_stretches(prepared, rate, stuck))

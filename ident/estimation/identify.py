@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -41,6 +42,8 @@ from lwr_driver.session import Session, Sessions, as_sessions
 
 if TYPE_CHECKING:
     from ident.estimation.choice import Choice
+
+logger = logging.getLogger(__name__)
 
 EstimatorFactory = Callable[[BaseSet, Problem, CovarianceSettings], Estimator]
 
@@ -199,6 +202,8 @@ class Identification(Tabular):
                     "lost_samples": session.counts["lost"],
                     "motor_delay_s": session.delay.seconds if session.delay is not None else None,
                     "motor_delay_std_s": session.delay.std if session.delay is not None else None,
+                    "joint_delay_s": session.joint_delay.seconds if session.joint_delay is not None else None,
+                    "joint_delay_std_s": session.joint_delay.std if session.joint_delay is not None else None,
                     "stamp_jitter_s": session.jitter_s,
                     "excitation_hz": session.excitation_hz,
                     "cutoff_hz": session.cutoff_hz,
@@ -254,6 +259,8 @@ class Identification(Tabular):
         ]
         for session, payload in zip(self.prepared, self.payloads, strict=True):
             delay = f", motor channel {session.delay}" if session.delay is not None else ""
+            if session.joint_delay is not None:
+                delay += f", joint torques {session.joint_delay}"
             lines.append(
                 f"{session.name}: payload {payload or 'none'}, {session.counts['rows']} rows, "
                 f"{session.counts['lost']} samples lost{delay}"
@@ -444,7 +451,6 @@ def observed(
     )
     make = partial(
         session_rows,
-        signals=settings.signals,
         structure=rows_structure,
         base=base,
         resonance_hz=settings.resonance_hz,
@@ -453,8 +459,11 @@ def observed(
         recall=recall,
     )
     # One session after the other, so that memory holds the full-rate signals of one only.
-    made = [make(session, payload, log=first) for session, payload in zip(chosen, mounted, strict=True)]
-    made = with_delays(made, list(zip(chosen, mounted, strict=True)), settings.signals, make)
+    pairs = list(zip(chosen, mounted, strict=True))
+    made = [make(session, payload, signals=settings.signals) for session, payload in pairs]
+    made = with_delays(made, pairs, settings.signals, make)
+    for warning in (text for one in made for text in one.prepared.warnings) if first else ():
+        logger.warning("%s", warning)
     prepared, problems = [one.prepared for one in made], [one.problem for one in made]
     instruments = [one.instruments for one in made if one.instruments is not None]
     _every_joint_moves(prepared, chain)

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,10 +232,9 @@ def _columns(
     result = []
     for session, payload, known in zip(sessions, found.payloads, found.prepared, strict=True):
         chosen = session.select(structure.chain.joint_names)
-        delay_s: float | Literal["estimate"] = "estimate" if known.delay is None else known.delay.seconds
         moving = prepare(
             chosen,
-            replace(settings.signals, motor_delay_s=delay_s),
+            known.signals,
             resonance_hz=settings.resonance_hz,
             motor=settings.model == 2,
             log=False,

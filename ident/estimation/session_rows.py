@@ -1,17 +1,20 @@
-"""The rows of each session of an estimate, and the delay of motor torques that have no joint torques beside them."""
+"""The rows of each session of an estimate, and the delays of the torques that the base model tells."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
 
 from fri.errors import DataError
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.structure import ModelStructure
 from ident.estimators.problem import Problem
 from ident.rows.content import Recall
-from ident.rows.delay import SHIFT_S, Delay, delay_alone
+from ident.rows.delay import Delay, delays_from_model, fits_better
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import prepare
@@ -36,22 +39,29 @@ class SessionRows:
     instruments: Problem | None
 
     @property
-    def delay_s(self) -> float:
-        """Delay of the motor torques in use [s]."""
-        return 0.0 if self.prepared.delay is None else self.prepared.delay.seconds
+    def side(self) -> Literal["joint", "motor"]:
+        """Side whose delay the base model tells: that of the other torques follows from it."""
+        return "joint" if self.prepared.mean_torque else "motor"
 
     @property
-    def alone(self) -> bool:
-        """Whether the motor torques have no joint torques beside them that tell their delay."""
-        return (
-            self.prepared.delay is not None and not self.prepared.mean_torque and bool(self.problem.nuisances)
-        )
+    def delay(self) -> Delay | None:
+        """Delay of the torques of this side, None without a row of them."""
+        if not any(group.side == self.side for group in self.problem.groups):
+            return None
+        return self.prepared.joint_delay if self.side == "joint" else self.prepared.delay
 
     def late(self, delay: Delay) -> SessionRows:
-        """The same with the delay of its motor torques as estimated."""
-        nuisances = tuple(replace(one, std=delay.std) for one in self.problem.nuisances)
-        problem = replace(self.problem, nuisances=nuisances)
-        return replace(self, prepared=replace(self.prepared, delay=delay), problem=problem)
+        """The same with the delay of this side as estimated, for rows at this delay."""
+        own = {k for k, group in enumerate(self.problem.groups) if group.side == self.side}
+        nuisances = tuple(
+            replace(one, std=delay.std) if own & one.columns.keys() else one for one in self.problem.nuisances
+        )
+        known: dict[str, Any] = {"joint_delay" if self.side == "joint" else "delay": delay}
+        return replace(
+            self,
+            prepared=replace(self.prepared, **known),
+            problem=replace(self.problem, nuisances=nuisances),
+        )
 
 
 def session_rows(
@@ -63,31 +73,23 @@ def session_rows(
     base: BaseSet,
     resonance_hz: float | None,
     motor: bool,
-    log: bool,
     advise: bool,
     recall: Recall,
-    delay_s: float | None = None,
-    instruments: bool = True,
 ) -> SessionRows:
-    """The rows of one session with the payload mounted in it.
-
-    delay_s : of its motor torques, None for that of `signals`. instruments : False leaves the commanded motion aside.
-    Others: as for `prepare` and `observe`.
-    """
-    used = signals if delay_s is None else replace(signals, motor_delay_s=delay_s)
+    """The rows of one session with the payload mounted in it; arguments as for `prepare` and `observe`."""
     whole = prepare(
         session,
-        used,
+        signals,
         resonance_hz=resonance_hz,
         motor=motor,
-        log=log,
+        log=False,
         advise=advise,
         blocks=True,
         recall=recall,
     )
     seen = observe([whole], [payload], structure, columns=base.columns, names=base.names, units=base.units)
     problem = without_dead(seen, session)
-    motion = commanded(session, whole) if instruments and not signals.average_periods else None
+    motion = None if signals.average_periods else commanded(session, whole)
     bare = replace(whole.without_samples(), settings=signals)
     del whole
     if motion is None:
@@ -102,42 +104,45 @@ def with_delays(
     signals: SignalSettings,
     make: Callable[..., SessionRows],
 ) -> list[SessionRows]:
-    """The rows with the delay of motor torques that have no joint torques beside them.
+    """The rows with the delays that the base model tells: of joint torques, or of motor torques alone.
 
-    It comes from the base model, so from rows at the delay found so far.
+    They come from rows at the delays found so far.
 
     of : session and payload of each. signals : of the estimate. make : `session_rows` with the rest of its arguments.
     """
-    if signals.motor_delay_s != "estimate" or not any(one.alone for one in made):
-        return made
-    found, late = list(made), [k for k, one in enumerate(made) if one.alone]
-    delays: list[Delay] = []
-    for _ in range(_DELAY_STEPS):
-        now = [found[k].delay_s for k in late]
-        shifted = []
-        for shift in (SHIFT_S, -SHIFT_S):
-            moved = [one.problem for one in found]
-            for k, delay_s in zip(late, now, strict=True):
-                moved[k] = make(*of[k], log=False, delay_s=delay_s + shift, instruments=False).problem
-            shifted.append(stack(moved))
+    found = list(made)
+    setting = {"joint": "joint_delay_s", "motor": "motor_delay_s"}
+    sides = {
+        k: one.side
+        for k, one in enumerate(made)
+        if one.delay is not None and getattr(signals, setting[one.side]) == "estimate"
+    }
+    delays: dict[int, Delay] = {}
+    for _ in range(_DELAY_STEPS if sides else 0):
+        now = {k: delay.seconds for k in sides if (delay := found[k].delay) is not None}
         try:
-            whole = stack([one.problem for one in found])
-            delays = delay_alone(whole, late, (shifted[0], shifted[1]), now)
+            delays = delays_from_model(stack([one.problem for one in found]), sides, now)
         except DataError as error:
-            logger.info("no delay of the motor torques by themselves: %s", error)
+            logger.info("no delay from the base model: %s", error)
             return found
-        for k, delay in zip(late, delays, strict=True):
-            rows = (
-                found[k]
-                if delay.seconds == found[k].delay_s
-                else make(*of[k], log=False, delay_s=delay.seconds)
+        moving = {k for k, delay in delays.items() if abs(delay.seconds - now[k]) > _SETTLED * delay.std}
+        for k, delay in delays.items():
+            stated: dict[str, Any] = {setting[sides[k]]: delay.seconds}
+            found[k] = (
+                make(*of[k], signals=replace(signals, **stated)).late(delay)
+                if k in moving
+                else found[k].late(replace(delay, seconds=now[k]))
             )
-            found[k] = rows.late(delay)
-        if all(
-            abs(delay.seconds - before) < _SETTLED * delay.std
-            for delay, before in zip(delays, now, strict=True)
-        ):
+        if not moving:
             break
-    for delay in delays:
-        logger.info("motor channel %s", delay)
+    if any(delay.seconds for delay in delays.values()):
+        after, before = (stack([one.problem for one in rows]) for rows in (found, made))
+        if not fits_better(after, before, sides):
+            for k, delay in delays.items():
+                std = float(np.hypot(delay.std, delay.seconds))
+                found[k] = made[k].late(
+                    replace(delay, seconds=0.0, std=std, how="with it no row fits better")
+                )
+    for k in sides:
+        logger.info("%s: %s torques %s", found[k].prepared.name, sides[k], found[k].delay)
     return found

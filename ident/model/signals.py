@@ -4,7 +4,7 @@ They stand in the provenance of the model, so that `validate`, `diagnose` and th
 in the same way::
 
     provenance:
-      signals: {cutoff_hz: 10.0, decimate_hz: 2.0, ..., motor_delay_s: 0.0012}
+      signals: {cutoff_hz: 10.0, decimate_hz: 2.0, ..., motor_delay_s: 0.0012, joint_delay_s: 0.0}
 """
 
 from __future__ import annotations
@@ -26,23 +26,28 @@ SIGNALS = "signals"
 def signals_entry(settings: SignalSettings, prepared: Sequence[PreparedSession] = ()) -> dict[str, Any]:
     """The entry of a model's provenance.
 
-    prepared : sessions of the estimate. Their cut-off and their delay of the motor channel (mean with the weight
-    of the inverse variances) replace a choice or an estimate in the settings.
+    prepared : sessions of the estimate. Their cut-off and the delays of their torques (means with the weight of the
+    inverse variances) replace a choice or an estimate in the settings.
     """
     entry = dataclasses.asdict(settings)
     if prepared:
         entry["cutoff_hz"] = float(np.median([one.cutoff_hz for one in prepared]))
-    delays = [one.delay for one in prepared if one.delay is not None]
-    if delays:
-        exact = [delay.seconds for delay in delays if not delay.std > 0.0]
-        weights = [1.0] * len(exact) if exact else [delay.std**-2 for delay in delays]
-        values = exact or [delay.seconds for delay in delays]
-        entry["motor_delay_s"] = float(np.average(values, weights=weights))
+    late = {
+        "motor_delay_s": [one.delay for one in prepared],
+        "joint_delay_s": [one.joint_delay for one in prepared],
+    }
+    for name, found in late.items():
+        delays = [delay for delay in found if delay is not None]
+        if delays:
+            exact = [delay.seconds for delay in delays if not delay.std > 0.0]
+            weights = [1.0] * len(exact) if exact else [delay.std**-2 for delay in delays]
+            values = exact or [delay.seconds for delay in delays]
+            entry[name] = float(np.average(values, weights=weights))
     return entry
 
 
 def signal_settings(model: DynamicModel) -> SignalSettings | None:
-    """The signal settings of a model, its motor delay included; None for a model without.
+    """The signal settings of a model, its delays included; None for a model without.
 
     Keys of other versions of this software are left aside. Raises ConfigurationError for values out of range.
     """

@@ -1,4 +1,4 @@
-"""Delay of the motor channel against the joint channel, from the difference of the torques of each joint.
+"""Delays of the torques: of the motor channel from the difference of the torques, of others from the base model.
 
 The difference obeys Model 3 of the paper at the motor channel's own times t,
 
@@ -10,7 +10,10 @@ terms pass the same low-pass. d solves a small nonlinear least-squares problem (
 standard deviation is robust to serial correlation and inflated by the scatter of the joints. An unknown delay biases
 Ia by -Fvm d, so its uncertainty enters the covariance of every estimate.
 
-Without joint torques the base model takes their place (`delay_alone`).
+The joint torques may be late themselves, or early, where the positions are late; and motor torques may have no joint
+torques beside them. Their delay follows from the base model (`delays_from_model`): to first order
+
+    tau(t) = Y(t) chi - d dtau/dt(t).
 
 The motors turn ahead of their links by tau_l / k. An error of the stated compliance makes a joint look late by about
 Fvm times that error, another one for each joint, so the joints count with this uncertainty beside their own.
@@ -27,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
+from ident.dynamics.base_set import independent_columns
 from ident.dynamics.parameters import Floats
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.least_squares import WeightedLeastSquares, weighted_solution
@@ -41,6 +45,8 @@ logger = logging.getLogger(__name__)
 DELAY_HZ, DELAY_DB = 5.0, 40.0
 _SYMBOLS = ("Ia", "Fvm", "Fcm", "offm")
 _STEPS = 12
+# Least share of a column that no column before has, for it to count.
+_SHOWN = 1e-6
 _GRID = 41
 # Least share of a row's filter on known samples.
 _KNOWN = 0.4
@@ -54,6 +60,11 @@ _ELASTIC_S = 2e-3
 _COMPLIANCE_SHARE = 0.3
 # Likelihood ratio (twice the log) of a delay at the edge of the search against none that is no chance.
 _DECISIVE = 25.0
+DISAGREEMENT = 3.0
+"""Scatter of seven joints over their standard deviations, exceeded once in a thousand healthy sessions, for deviations
+that are a third too small."""
+# A delay is common to joints that disagree where it is so many times their scatter.
+_ALIKE = 3.0
 # A delay within this many standard deviations of zero is not told apart from zero.
 _DISTINCT = 1.96
 # Latest estimates: an estimator prepares a session several times.
@@ -62,12 +73,13 @@ _MOST_ESTIMATES = 64
 
 @dataclass(frozen=True)
 class Delay:
-    """Delay of the motor channel against the joint channel.
+    """Delay of a torque channel against the motion.
 
     seconds : the delay in use [s], zero where the data cannot tell it from zero. std : its standard deviation [s],
         with the uncertainty of a delay that is set to zero. how : origin. estimate : the unrestricted estimate [s].
     by_joint : delay of each moving joint by itself, and its standard deviation, with that of its compliance [s].
     disagreement : scatter of the joints over their standard deviations; `std` already includes this factor.
+    earliest : least delay [s]: zero, or -inf where the positions are late.
     """
 
     seconds: float
@@ -76,6 +88,7 @@ class Delay:
     estimate: float = 0.0
     by_joint: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     disagreement: float = 1.0
+    earliest: float = 0.0
 
     @classmethod
     def of(
@@ -85,31 +98,33 @@ class Delay:
         how: str,
         by_joint: Mapping[str, tuple[float, float]],
         disagreement: float,
+        earliest: float = 0.0,
     ) -> Delay:
-        """The delay of an estimate: zero within its interval, and where it would be negative."""
-        if estimate > _DISTINCT * std:
-            return cls(estimate, std, how, estimate, by_joint, disagreement)
-        return cls(0.0, float(np.hypot(std, max(estimate, 0.0))), how, estimate, by_joint, disagreement)
+        """The delay of an estimate: zero within its interval, and never before the earliest."""
+        possible = max(estimate, earliest)
+        if abs(possible) <= _DISTINCT * std:
+            std, possible = float(np.hypot(std, possible)), 0.0
+        return cls(possible, std, how, estimate, by_joint, disagreement, earliest)
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval [s]; no channel is early."""
-        if self.seconds > 0.0 or not self.std:
-            return max(self.seconds - 1.96 * self.std, 0.0), self.seconds + 1.96 * self.std
-        return 0.0, 1.96 * self.std
+        """95 % interval [s], from the earliest on."""
+        reach = 1.96 * self.std
+        return max(self.seconds - reach, min(self.earliest, self.seconds)), self.seconds + reach
 
     @property
     def early(self) -> bool:
-        """Whether the estimate is negative beyond its interval and beyond the elasticity of joints."""
-        return self.estimate < -3.0 * self.std - _ELASTIC_S
+        """Whether the estimate is before the earliest, beyond its interval and beyond the elasticity of joints."""
+        return self.estimate < self.earliest - 3.0 * self.std - _ELASTIC_S
 
     def __str__(self) -> str:
-        low, high = (1e3 * bound for bound in self.interval)
-        if self.std == 0.0:
-            return f"late by {1e3 * self.seconds:.2f} ms ({self.how})"
+        late = -1.0 if self.seconds < 0.0 else 1.0
+        low, high = sorted(1e3 * late * bound for bound in self.interval)
+        origin = f"{low:.2f} to {high:.2f} ms, {self.how}" if self.std else self.how
         if self.seconds == 0.0:
-            return f"not late (0 to {high:.2f} ms, {self.how})"
-        return f"late by {1e3 * self.seconds:.2f} ms ({low:.2f} to {high:.2f} ms, {self.how})"
+            return f"not late ({origin})"
+        where = "late by" if late > 0.0 else "ahead of the positions by"
+        return f"{where} {1e3 * abs(self.seconds):.2f} ms ({origin})"
 
 
 _estimates = Kept[Delay](_MOST_ESTIMATES)
@@ -142,15 +157,19 @@ def estimate_delay(
     cutoff_hz: float = 5.0,
     search_s: float = 0.1,
     compliance: Floats | None = None,
+    earliest_s: float = 0.0,
 ) -> Delay:
     """Delay d of the motor channel: tau_m(t + d) belongs to the joint state at t; of equal data estimated once.
 
     compliance : (J,) stated for the motion of the motors [rad/Nm], None where motors and links move alike.
+    earliest_s : least delay, -inf where the positions are late.
 
     A motion too short or too weak for an estimate gives zero, with the sample time of the motor channel as its
     standard deviation. Raises DataError when the data clearly prefer a delay at the edge of +- `search_s`.
     """
-    found = _estimates.of(_estimated, stretches, tuple(joint_names), cutoff_hz, search_s, compliance)
+    found = _estimates.of(
+        _estimated, stretches, tuple(joint_names), cutoff_hz, search_s, compliance, earliest_s
+    )
     logger.info("motor channel %s", found)
     return found
 
@@ -161,6 +180,7 @@ def _estimated(
     cutoff_hz: float,
     search_s: float,
     compliance: Floats | None,
+    earliest_s: float,
 ) -> Delay:
     by_stretch = [list(blocks) for _, blocks in groupby(stretches, key=lambda data: data.span)]
     parts = [part for blocks in by_stretch if (part := _Rows.of(blocks, cutoff_hz, search_s)) is not None]
@@ -192,67 +212,100 @@ def _estimated(
     steps, stds, viscous = _newton(parts, joints, delay, separate=True)
     elastic = 0.0 if compliance is None else _COMPLIANCE_SHARE * np.abs(viscous) * compliance[joints]
     names = [joint_names[j] for j in joints]
-    return _together(names, delay + steps, np.hypot(stds, elastic), "from the torque difference")
+    return _together(names, delay + steps, np.hypot(stds, elastic), "from the torque difference", earliest_s)
 
 
-def _together(names: Sequence[str], values: Floats, stds: Floats, how: str) -> Delay:
+def _together(names: Sequence[str], values: Floats, stds: Floats, how: str, earliest_s: float) -> Delay:
     """The delay of a channel from those of its joints with standard deviations (J,)."""
     weights = stds**-2.0
     mean = float(np.sum(weights * values) / np.sum(weights))
     chi = float(np.sqrt(np.sum(weights * (values - mean) ** 2) / max(len(values) - 1, 1)))
     disagreement = max(1.0, chi)
     by_joint = {name: (float(v), float(s)) for name, v, s in zip(names, values, stds, strict=True)}
-    return Delay.of(mean, float(np.sum(weights)) ** -0.5 * disagreement, how, by_joint, disagreement)
+    std = float(np.sum(weights)) ** -0.5 * disagreement
+    return Delay.of(mean, std, how, by_joint, disagreement, earliest_s)
 
 
-def delay_alone(
-    problem: Problem, records: Sequence[int], shifted: tuple[Problem, Problem], before: Sequence[float]
-) -> list[Delay]:
-    """Delays of motor torques without joint torques beside them: of each record's torque against the base model.
+def delays_from_model(
+    problem: Problem, sides: Mapping[int, str], before: Mapping[int, float]
+) -> dict[int, Delay]:
+    """Delay of the torques of one side of each of these records, against the base model.
 
-    A Gauss-Newton step with all base parameters free and a delay of each joint of each record.
+    One Gauss-Newton step with all base parameters free and a delay of each joint of each record. Other rows of these
+    records have no part in it, because their delay follows from these.
 
-    problem : stacked rows of all records with the delays `before` [s] of these `records`. shifted : the same rows with
-    delays `SHIFT_S` longer and shorter.
+    problem : stacked rows of all records, with the slopes of the torques as nuisances. sides : "joint" or "motor" by
+    number of the record. before : delay of the rows of each [s].
 
-    Raises DataError for rows that do not determine all parameters, or no delay.
+    Raises DataError for rows that determine no delay.
     """
-    problem.require_rank()
-    values = weighted_solution(problem)[0]
-    longer, shorter = ({(g.record, g.joint): g for g in one.groups if g.side == "motor"} for one in shifted)
-    places = [(k, joint) for k in records for joint in dict.fromkeys(g.joint for g in problem.groups)]
+    slopes = {number: slope for one in problem.nuisances for number, slope in one.columns.items()}
+    used = _used(problem, sides)
+    places = [
+        (record, joint)
+        for record, side in sides.items()
+        for joint in dict.fromkeys(
+            problem.groups[k].joint
+            for k in used
+            if problem.groups[k].record == record and problem.groups[k].side == side and np.any(slopes[k])
+        )
+    ]
     groups = []
-    for group in problem.groups:
-        key, late = (group.record, group.joint), np.zeros((len(group.target), len(places)))
-        if group.side == "motor" and key in places and key in longer and key in shorter:
-            rest = [_residual_at(one[key], values, group.time_index) for one in (longer, shorter)]
-            late[:, places.index(key)] = (rest[1] - rest[0]) / (2.0 * SHIFT_S)
+    for k in used:
+        group, late = problem.groups[k], np.zeros((len(problem.groups[k].target), len(places)))
+        if (group.record, group.joint) in places:
+            late[:, places.index((group.record, group.joint))] = -slopes[k]
         groups.append(replace(group, matrix=np.hstack([group.matrix, late])))
-    acting = [any(np.any(g.matrix[:, len(values) + k]) for g in groups) for k in range(len(places))]
-    used = [*range(len(values)), *(len(values) + k for k, acts in enumerate(acting) if acts)]
-    names = (*problem.names, *(f"delay {k} {joint}" for k, joint in places))
-    wide = replace(problem, names=names, groups=tuple(groups), units=(), nuisances=()).select(used)
-    fit = WeightedLeastSquares(CovarianceSettings("hac")).fit(wide)
-    found = dict(zip(wide.names, zip(fit.values, fit.std, strict=True), strict=True))
-    delays = []
-    for k, start in zip(records, before, strict=True):
-        mine = {
-            joint: found[f"delay {k} {joint}"]
-            for i, joint in places
-            if i == k and f"delay {k} {joint}" in found
-        }
+    base = len(problem.names)
+    names = (*problem.names, *(f"delay {record} {joint}" for record, joint in places))
+    wide = replace(problem, names=names, groups=tuple(groups), units=(), nuisances=())
+    # What the motion does not show of the base parameters has no part in the delays.
+    shown = _shown(wide)
+    fit = WeightedLeastSquares(CovarianceSettings("hac")).fit(wide.select(shown))
+    rows = {places[column - base]: row for row, column in enumerate(shown) if column >= base}
+    found = {}
+    for record, side in sides.items():
+        mine = {joint: row for (owner, joint), row in rows.items() if owner == record}
         if not mine:
-            raise DataError(f"no motor torque of {problem.record_names[k]} changes with its delay")
-        steps, stds = np.array(list(mine.values())).T
-        delays.append(_together(list(mine), start + steps, stds, "from the base model"))
-    return delays
+            raise DataError(f"no {side} torque of {problem.record_names[record]} changes with its delay")
+        own = list(mine.values())
+        earliest = -np.inf if side == "joint" else 0.0
+        delay = _together(
+            list(mine), before[record] + fit.values[own], fit.std[own], "from the base model", earliest
+        )
+        scatter = delay.std * len(own) ** 0.5
+        if delay.disagreement > DISAGREEMENT and _ALIKE * scatter > abs(delay.seconds):
+            # What the base model lacks is no delay.
+            delay = replace(delay, seconds=0.0, std=0.0, how="the joints disagree")
+        found[record] = delay
+    return found
 
 
-def _residual_at(group: RowGroup, values: Floats, wanted: NDArray[np.int64]) -> Floats:
-    """Residual of a group's rows at the wanted time indices, zero where it has none."""
-    rest = group.target - group.matrix @ values
-    place = np.clip(np.searchsorted(group.time_index, wanted), 0, len(rest) - 1)
-    return np.where(group.time_index[place] == wanted, rest[place], 0.0)
+def fits_better(after: Problem, before: Problem, sides: Mapping[int, str]) -> bool:
+    """Whether the base model fits the rows of these sides better at other delays, by the likelihood of all joints."""
+    squares = []
+    for problem in (after, before):
+        groups = tuple(problem.groups[k] for k in _used(problem, sides))
+        own = replace(problem, groups=groups, nuisances=())
+        own = own.select(_shown(own))
+        rest = own.residuals(weighted_solution(own)[0])
+        squares.append(
+            [float(np.mean(np.concatenate([rest[k] for k in c.groups]) ** 2)) for c in own.classes]
+        )
+        rows = [c.factor.rows for c in own.classes]
+    return float(np.log(squares[0]) @ rows) < float(np.log(squares[1]) @ rows)
+
+
+def _used(problem: Problem, sides: Mapping[int, str]) -> list[int]:
+    """Row groups of these sides of these records, and all of other records."""
+    return [k for k, group in enumerate(problem.groups) if group.side == sides.get(group.record, group.side)]
+
+
+def _shown(problem: Problem) -> list[int]:
+    """Columns that the rows tell from those before them."""
+    factor = problem.weighted(np.ones(len(problem.classes))).r[:, :-1]
+    scale = np.linalg.norm(factor, axis=0)
+    return independent_columns(factor / np.where(scale, scale, 1.0), range(len(scale)), _SHOWN)
 
 
 def _unknown(stretches: Sequence[DelayData], why: str) -> Delay:

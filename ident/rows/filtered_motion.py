@@ -17,6 +17,7 @@ from ident.rows.delay import DELAY_DB, DELAY_HZ
 from ident.rows.filters import (
     Excitation,
     SignalSettings,
+    ahead,
     differentiate,
     enough,
     half_width,
@@ -80,7 +81,8 @@ class WideMotion:
             torque[~good, joint] = np.interp(grid[~good], grid[good], torque[good, joint])
         drive = None
         if stiffness is not None:
-            twist = low_pass(torque / stiffness, part.dt, settings.cutoff, settings.order)
+            present = ahead(torque, part.dt, settings.joint_delay)
+            twist = low_pass(present / stiffness, part.dt, settings.cutoff, settings.order)
             rate, change = differentiate(twist, part.dt)
             drive = DriveMotion(qd + rate, qdd + change)
         return cls(low, q, qd, qdd, torque, flagged, drive)
@@ -101,7 +103,8 @@ def recalled(
     make = partial(WideMotion.of, part, low, high, effort_flags, times, settings, stiffness)
     if high - low < part.count or 8 * effort_flags.shape[1] * part.count >= LEAST_BYTES:
         return make()
-    return recall.of(make, *same, settings.stiffness_nm_rad, part.start, most=_MOST_MOTIONS)
+    springs = None if stiffness is None else (settings.stiffness_nm_rad, settings.joint_delay)
+    return recall.of(make, *same, springs, part.start, most=_MOST_MOTIONS)
 
 
 @dataclass(frozen=True)
@@ -178,14 +181,33 @@ class Motion:
         return self.start + settings.edge, self.end - settings.edge
 
     def channel(self, settings: SignalSettings) -> TorqueChannel:
-        """The joint torque channel, without the filter's ends."""
+        """The joint torque with the motion at its own times minus its delay, without the filter's ends."""
         cut, count = int(np.ceil(settings.edge / self.dt)), round((self.end - self.start) / self.dt) + 1
-        part = slice(max(cut - self.low, 0), max(min(count - cut - self.low, len(self.q)), 0))
-        flagged = self.flagged[part]
+        late, end = settings.joint_delay / self.dt, self.low + len(self.q)
+        first, here = max(cut + int(np.ceil(late)), 0), self.low + int(np.ceil(max(late, 0.0)))
+        if first < here:
+            # Samples averaged before a low-pass are the same in all blocks.
+            together = thinning(self.dt, settings.decimate)
+            first += -(-(here - first) // together) * together
+        last = min(count - cut + int(np.floor(late)), count, end + int(np.floor(min(late, 0.0))))
+        part = slice(first - self.low, max(last, first) - self.low)
+        times, flagged = self.times[part] - settings.joint_delay, self.flagged[part]
+        q, qd, qdd, away = self._at(times)
         return TorqueChannel(
-            "joint", self.times[part], self.q[part], self.qd[part], self.qdd[part], self.torque[part],
-            flagged, self.away[part] & ~flagged, period_s=self.dt,
-        )  # fmt: skip
+            "joint", times, q, qd, qdd, self.torque[part], flagged, away & ~flagged, period_s=self.dt
+        )
+
+    def _at(self, times: Floats) -> tuple[Floats, Floats, Floats, BoolArray]:
+        """q, qd, qdd and whether away from reversals at other times."""
+        q, qd, qdd = (
+            interpolate_uniform(state, self.first, self.dt, times) for state in (self.q, self.qd, self.qdd)
+        )
+        nearest = np.rint((times - self.first) / self.dt).astype(np.int64)
+        return q, qd, qdd, self.away[np.clip(nearest, 0, len(self.q) - 1)]
+
+    def present_torque(self, settings: SignalSettings) -> Floats:
+        """Joint torque (n, J) of the motion's own times."""
+        return ahead(self.torque, self.dt, settings.joint_delay)
 
     def motor_channel(
         self, times: Floats, torque: Floats, flags: BoolArray, delay: float, settings: SignalSettings
@@ -212,14 +234,12 @@ class Motion:
             high = min(high, until)
         inside = slice(low, high)
         actual, flagged = actual[inside], flags[inside]
-        start, dt = self.first, self.dt
-        q, qd, qdd = (interpolate_uniform(state, start, dt, actual) for state in (self.q, self.qd, self.qdd))
-        at = np.clip(np.rint((actual - start) / dt).astype(np.int64), 0, len(self.q) - 1)
+        q, qd, qdd, away = self._at(actual)
         drive = None
         if self.drive is not None:
             moved = (self.drive.speed, self.drive.acceleration)
-            drive = DriveMotion(*(interpolate_uniform(state, start, dt, actual) for state in moved))
-        known = self.away[at] & ~flagged
+            drive = DriveMotion(*(interpolate_uniform(state, self.first, self.dt, actual) for state in moved))
+        known = away & ~flagged
         return TorqueChannel(
             "motor", actual, q, qd, qdd, torque[inside], flagged, known, drive, period_s=period
         )
@@ -234,7 +254,8 @@ def filtered_motions(
     """The motions of all stretches, block after block. wide : the samples of a stretch between two numbers."""
     seen = turning_reach(settings.reversal, settings.standstill_rad_s, settings.turning)
     for part in parts:
-        around = int(np.ceil((settling(settings.cutoff, settings.order) + seen) / part.dt)) + 16
+        needed = settling(settings.cutoff, settings.order) + seen + abs(settings.joint_delay)
+        around = int(np.ceil(needed / part.dt)) + 16
         for span, core in _cut(part, settings, blocks):
             low, high = max(span[0] - around, 0), min(span[1] + around, part.count)
             yield Motion.of(part, span, core, wide(part, low, high), settings)
@@ -267,7 +288,7 @@ def _cut(
         half_width(settings.decimate, settings.attenuation_db) + settling(2.5 * settings.decimate),
         half_width(delay_hz, DELAY_DB) + settings.delay_search_s + settling(3.0 * delay_hz),
     )
-    reach = -(-round((reach_s + 0.5) / part.dt) // together) * together
+    reach = -(-round((reach_s + abs(settings.joint_delay) + 0.5) / part.dt) // together) * together
     for k in range(count):
         first, last = cut + k * size, cut + (k + 1) * size
         low = first - reach if k and first - reach > cut else 0

@@ -30,6 +30,7 @@ NYQUIST_SHARE = 0.2
 
 Frequency = Annotated[float, within(0.0, 1e5, "Hz", above=True)]
 _Span = Annotated[float, within(0.0, 1e5, "s")]
+DelaySetting = Annotated[float, within(-10.0, 10.0, "s")] | Literal["estimate"]
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,9 @@ class SignalSettings:
     standstill_rad_s : a joint below this speed rests, and its Coulomb torque is unknown.
     known_share : least share of a row's filter on samples measured and away from reversals.
     outlier_scale : distance of an outlier from the running median, in robust standard deviations.
-    motor_delay_s : delay of the motor channel's times [s], or "estimate" to estimate it from the data.
-    delay_search_s : largest delay searched, in both directions.
+    motor_delay_s : delay of the motor torques against the positions [s], or "estimate" to estimate it from the data.
+    joint_delay_s : that of the joint torques; below zero the positions are late.
+    delay_search_s : largest delay of the motor torques searched, in both directions.
     stiffness_nm_rad : of the joints, for the motors' motion against the links: the joint torque twists a joint, and
         the drive's friction and inertia act on the motor. Without it an elastic joint makes the motor channel look
         early by Fvm / stiffness. None: rigid joints.
@@ -76,7 +78,8 @@ class SignalSettings:
     standstill_rad_s: Annotated[float, within(0.0, 100.0, "rad/s")] = 2e-3
     known_share: Annotated[float, within(0.0, 1.0, "share")] = 0.4
     outlier_scale: Annotated[float, within(0.0, 1e6, above=True)] = 8.0
-    motor_delay_s: Annotated[float, within(-10.0, 10.0, "s")] | Literal["estimate"] = "estimate"
+    motor_delay_s: DelaySetting = "estimate"
+    joint_delay_s: DelaySetting = "estimate"
     delay_search_s: Annotated[float, within(0.0, 10.0, "s", above=True)] = 0.1
     stiffness_nm_rad: tuple[Annotated[float, within(0.0, 1e12, "Nm/rad", above=True)], ...] | None = None
 
@@ -153,6 +156,16 @@ class SignalSettings:
         return self.rate_hz if self.rate_hz is not None else 2.5 * self.decimate
 
     @property
+    def joint_delay(self) -> float:
+        """Delay of the joint torques in use [s], zero until it is estimated."""
+        return 0.0 if self.joint_delay_s == "estimate" else float(self.joint_delay_s)
+
+    @property
+    def punctual(self) -> SignalSettings:
+        """The same with no channel late."""
+        return replace(self, motor_delay_s=0.0, joint_delay_s=0.0)
+
+    @property
     def edge(self) -> float:
         """Time lost at each end to the Butterworth filter [s]."""
         return self.edge_s if self.edge_s is not None else 2.0 / self.cutoff
@@ -203,6 +216,14 @@ def interpolate_uniform(values: Floats, start: float, dt: float, times: Floats) 
             return values[index[0] : index[-1] + 1]
         return values[index]
     return _lagrange(np.ascontiguousarray(values), np.ascontiguousarray(position))
+
+
+def ahead(values: Floats, dt: float, by_s: float) -> Floats:
+    """Values (n, k) of a channel at times `by_s` after its own, the first and last value beyond its ends."""
+    if by_s == 0.0:
+        return values
+    place = np.clip(np.arange(len(values)) + by_s / dt, 0.0, len(values) - 1.0)
+    return interpolate_uniform(values, 0.0, 1.0, place)
 
 
 @njit(cache=True, nogil=True)

@@ -91,7 +91,7 @@ def observe(
     groups: list[RowGroup] = []
     nuisances: list[Nuisance] = []
     for number, (session, payload) in enumerate(zip(sessions, payloads, strict=True)):
-        slopes: dict[int, Floats] = {}
+        slopes: dict[bool, dict[int, Floats]] = {False: {}, True: {}}
         by_side = {side: _Collected(session) for side in structure.sides}
         for passage in session.passages:
             for side, rows in by_side.items():
@@ -100,11 +100,11 @@ def observe(
                     rows.add(part)
         for side, rows in by_side.items():
             for group, slope in rows.groups(number, side):
-                if side != "joint":
-                    slopes[len(groups)] = slope
+                slopes[side == "joint"][len(groups)] = slope
                 groups.append(group)
-        if session.delay is not None and slopes:
-            nuisances.append(Nuisance(f"motor delay of {session.name}", session.delay.std, slopes))
+        for sensed, name, delay in ((False, "motor", session.delay), (True, "joint", session.joint_delay)):
+            if delay is not None and slopes[sensed]:
+                nuisances.append(Nuisance(f"{name} delay of {session.name}", delay.std, slopes[sensed]))
     if not groups:
         raise DataError(
             f"no usable row for {' and '.join(structure.sides)} torque: every row was dropped because a "
@@ -183,7 +183,7 @@ def _side(
     else:
         return None
     matrix, target = _filtered(channel, passage.rows, side, structure, payload, columns, session)
-    slope = np.zeros_like(target) if side == "joint" else _slope(channel, passage.rows, session)
+    slope = _slope(channel, passage.rows, session)
     passage.release()
     return _Part(matrix, target, slope, valid, passage.index)
 

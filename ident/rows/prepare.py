@@ -21,7 +21,7 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import Floats
 from ident.rows.content import Recall
 from ident.rows.data_quality import Frozen, frozen_flags, frozen_positions, frozen_torques, held, stale
-from ident.rows.delay import DELAY_HZ, Delay, DelayData, estimate_delay
+from ident.rows.delay import DELAY_HZ, DISAGREEMENT, Delay, DelayData, estimate_delay
 from ident.rows.filtered_motion import (
     Motion,
     excitation_hz,
@@ -49,10 +49,6 @@ from lwr_driver.session import JointColumns, Session
 from lwr_driver.session.spool import release, shelved, spans
 
 logger = logging.getLogger(__name__)
-
-# Scatter of seven joints over their standard deviations, exceeded once in a thousand healthy sessions, for deviations
-# that are a third too small.
-_DISAGREEMENT = 3.0
 
 
 def prepare(
@@ -141,7 +137,7 @@ def prepare(
     delay = None
     if motor_data is not None:
         delay = _delay(motor_data, motions, session.joint_names, settings, springs, sensed)
-        if delay.disagreement > _DISAGREEMENT:
+        if delay.disagreement > DISAGREEMENT:
             spread = ", ".join(f"{joint} {1e3 * own:.1f}" for joint, (own, _) in delay.by_joint.items())
             warnings.append(
                 f"{name}: the joints disagree about the motor channel's delay ({spread} ms), "
@@ -201,6 +197,7 @@ def prepare(
         uid=session.metadata.get("uid", ""),
         mean_torque=_mean_torque(passages) if sensed else (),
         jitter_s=None if clock is None else clock.jitter_s,
+        joint_delay=_joint_delay(settings) if sensed else None,
     )
 
 
@@ -379,7 +376,8 @@ def _delay(
     times, torque, _ = motor_data
     data = [
         DelayData(
-            m.times, *m.of_motors, m.torque, m.away & ~m.flagged, times, torque, m.usable(settings), m.core
+            m.times, *m.of_motors, m.present_torque(settings), m.away & ~m.flagged, times, torque,
+            m.usable(settings), m.core,
         )
         for m in motions
     ]  # fmt: skip
@@ -390,7 +388,14 @@ def _delay(
         cutoff_hz=min(DELAY_HZ, settings.cutoff, 0.2 * rate),
         search_s=settings.delay_search_s,
         compliance=None if springs is None else 1.0 / springs,
+        # Joint torques ahead of the positions say that these are late.
+        earliest_s=-np.inf if settings.joint_delay < 0.0 else 0.0,
     )
+
+
+def _joint_delay(settings: SignalSettings) -> Delay:
+    how = "the base model tells it" if settings.joint_delay_s == "estimate" else "stated"
+    return Delay(settings.joint_delay, 0.0, how)
 
 
 def clock_ns(columns: JointColumns) -> NDArray[np.int64]:

@@ -96,7 +96,8 @@ class PreparedSession:
     """A session ready for any regressor.
 
     row_time_s : time between rows. period_rows : rows in a period of the excitation, None without periods.
-    delay : of the motor channel, None without one. counts : lost samples, outliers, dropped rows.
+    delay, joint_delay : of the motor and of the joint torques, None without them. counts : lost samples, outliers,
+        dropped rows.
     moving : moving joints. warnings : sentences for the report. uid : of the session, from its metadata.
     mean_torque : (J,) mean of |joint torque| from the first row to the last [Nm]; empty without the sensors.
     jitter_s : rms of the stamps about the counted times [s] (`sample_clock`), None where the stamps stand.
@@ -118,6 +119,7 @@ class PreparedSession:
     uid: str = ""
     mean_torque: tuple[float, ...] = ()
     jitter_s: float | None = None
+    joint_delay: Delay | None = None
 
     def __repr__(self) -> str:
         return (
@@ -128,6 +130,13 @@ class PreparedSession:
     def without_samples(self) -> PreparedSession:
         """The same without its passages, to save memory; enough for the report."""
         return replace(self, passages=())
+
+    @property
+    def signals(self) -> SignalSettings:
+        """The settings with the delays in use stated."""
+        delays = {"motor_delay_s": self.delay, "joint_delay_s": self.joint_delay}
+        stated: dict[str, Any] = {name: one.seconds for name, one in delays.items() if one is not None}
+        return replace(self.settings, **stated)
 
     @property
     def has_motor(self) -> bool:

@@ -195,7 +195,7 @@ def _with_decimation(
     band = min((edge for edge in edges if edge is not None), default=None)
     if settings.decimate_hz is not None:
         return settings, band
-    stated = replace(settings, motor_delay_s=0.0)
+    stated = settings.punctual
     rough = [prepare(session, stated, log=False, recall=recall) for session in sessions]
     excitation = max(session.excitation_hz for session in rough)
     shortest = min(session.duration_s for session in sessions)

@@ -95,7 +95,7 @@ def sampled(
     found = []
     for record, session in enumerate(sessions):
         sensed = bool(session.joint.effort.shape[1])
-        wanted = replace(signals, motor_delay_s=0.0)
+        wanted = signals.punctual
         motor = session.motor is not None
         whole = prepare(session, wanted, motor=motor, log=False, blocks=True, recall=recall)
         # Blocks of one stretch, side by side.

@@ -78,6 +78,7 @@ class Sensors:
     correlation_s: float = 0.0
     motor_step_s: float = 0.0
     motor_delay_s: float = 0.0
+    joint_delay_s: float = 0.0
     lost: tuple[int, ...] = ()
     joint_outliers: tuple[tuple[int, int, float], ...] = ()
     position_outliers: tuple[tuple[int, int, float], ...] = ()
@@ -131,7 +132,7 @@ def session(
         return states
 
     q, qd, qdd = motion(time)
-    joint_torque, _ = torques(q, qd, qdd, loaded)
+    joint_torque, _ = torques(*motion(time - sensors.joint_delay_s), loaded)
     position = q + sensors.position * random.normal(size=q.shape)
     joint_torque = joint_torque + sensors.joint * correlated(random, q.shape, dt, sensors.correlation_s)
     for row, column, value in sensors.joint_outliers:

@@ -35,10 +35,12 @@ def long(monkeypatch):
     return replace(session, joint=replace(joint, **kept))
 
 
-@pytest.mark.parametrize("stiffness", [None, (9000.0,) * 7])
-def test_blocks_give_the_rows_of_the_whole_session(long, stiffness):
+@pytest.mark.parametrize(
+    ("stiffness", "late_s"), [(None, 0.0), ((9000.0,) * 7, 0.0), ((9000.0,) * 7, 0.0043), (None, -0.0037)]
+)
+def test_blocks_give_the_rows_of_the_whole_session(long, stiffness, late_s):
     structure = ModelStructure(arm.chain(), 2)
-    settings = SignalSettings(stiffness_nm_rad=stiffness)
+    settings = SignalSettings(stiffness_nm_rad=stiffness, joint_delay_s=late_s)
     whole, blocks = (prepare(long, settings, log=False, blocks=cut) for cut in (False, True))
     assert len(blocks.passages) > 3 * len(whole.passages)
     assert blocks.counts == whole.counts

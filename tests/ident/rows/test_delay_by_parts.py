@@ -131,7 +131,7 @@ def test_a_delay_within_its_interval_is_zero_with_the_whole_uncertainty():
     stated = Delay(0.007, 0.0, "stated")
     assert stated.interval == (0.007, 0.007)
     assert str(stated) == "late by 7.00 ms (stated)"
-    assert str(same).startswith("not late (0 to 8.")
+    assert str(same).startswith("not late (0.00 to 8.")
 
 
 def test_a_stated_delay_is_taken_and_motor_torques_alone_have_none():

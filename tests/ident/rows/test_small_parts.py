@@ -433,8 +433,10 @@ def test_stacked_problems_keep_records_nuisances_and_periods():
     assert [group.record for group in two.groups] == [k for k in range(3) for _ in one.groups]
     assert two.record_names == one.record_names * 3
     count = len(one.groups)
+    assert len(one.nuisances) == 2
     for k, nuisance in enumerate(two.nuisances):
-        assert set(nuisance.columns) == {place + k * count for place in one.nuisances[0].columns}
+        record, side = divmod(k, 2)
+        assert set(nuisance.columns) == {place + record * count for place in one.nuisances[side].columns}
     with pytest.raises(DataError, match="at least one"):
         stack([])
     with pytest.raises(DataError, match="different parameters"):

@@ -1,0 +1,136 @@
+"""Delays from the base model: of joint torques, and of motor torques without joint torques beside them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fri.errors import DataError
+from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.validate import validate
+from ident.rows.delay import delays_from_model
+from lwr_driver.session import Session
+from tests.ident.estimation_arm import Sensors, chain, session, true_base
+
+SETTINGS = IdentificationSettings(estimator="wls", essential=None)
+
+
+def alone(late_s: float, seed: int, motion: int = 5, *, loaded: bool = False) -> Session:
+    """Motor torques of a whole arm, without its joint torques."""
+    sensors = Sensors(position=1e-5, motor=0.3, motor_delay_s=late_s)
+    whole = session(
+        sensors=sensors, seed=seed, motion_seed=motion, loaded=loaded, metadata={"uid": f"{seed}"}
+    )
+    return replace(whole, joint=replace(whole.joint, effort=np.zeros((len(whole.joint.log_time), 0))))
+
+
+def estimated(late_s: float) -> Identification:
+    return identify([alone(late_s, 1), alone(late_s, 2, 6, loaded=True)], chain(), SETTINGS)
+
+
+@pytest.mark.parametrize("late_s", [0.004, 0.012])
+def test_a_late_channel_is_found_with_its_interval(late_s: float) -> None:
+    found = estimated(late_s)
+    for one in found.prepared:
+        assert one.delay is not None
+        assert one.delay.how == "from the base model"
+        assert one.delay.seconds == pytest.approx(late_s, abs=3.0 * one.delay.std)
+        assert 0.0 < one.delay.std < 1e-3
+    z = (found.estimate.values - true_base(found)) / found.estimate.std
+    assert np.mean(np.abs(z) < 2.0) > 0.9
+    assert np.max(np.abs(z)) < 4.5
+    signals = found.model.provenance["signals"]
+    assert signals["motor_delay_s"] == pytest.approx(late_s, abs=1e-3)
+    shown = validate(found.model, [alone(late_s, 3, 7)])
+    stated = replace(SETTINGS, signals=replace(SETTINGS.signals, motor_delay_s=0.0))
+    blind = identify([alone(late_s, 1), alone(late_s, 2, 6, loaded=True)], chain(), stated)
+    assert max(shown.scores[0].relative.values()) < max(
+        validate(blind.model, [alone(late_s, 3, 7)]).scores[0].relative.values()
+    )
+
+
+def test_a_punctual_channel_is_not_late_and_its_interval_is_in_the_deviations() -> None:
+    found = estimated(0.0)
+    stated = replace(SETTINGS, signals=replace(SETTINGS.signals, motor_delay_s=0.0))
+    known = identify([alone(0.0, 1), alone(0.0, 2, 6, loaded=True)], chain(), stated)
+    delays = [one.delay for one in found.prepared]
+    assert all(delay is not None and delay.seconds == 0.0 and delay.std > 0.0 for delay in delays)
+    place = found.base.names.index("Ia4")
+    assert found.estimate.std[place] > known.estimate.std[place]
+
+
+def sensed(
+    late_s: float, seed: int, motion: int = 5, *, loaded: bool = False, motor_s: float = 0.0
+) -> Session:
+    """Joint torques `late_s` and motor torques `motor_s` after the positions."""
+    sensors = Sensors(position=1e-5, joint=0.05, motor=0.3, motor_delay_s=motor_s, joint_delay_s=late_s)
+    return session(sensors=sensors, seed=seed, motion_seed=motion, loaded=loaded, metadata={"uid": f"{seed}"})
+
+
+@pytest.mark.parametrize(("late_s", "motor_s"), [(0.012, 0.0), (0.003, 0.005), (-0.004, -0.002)])
+def test_late_joint_torques_are_found_and_the_motor_torques_against_the_motion(
+    late_s: float, motor_s: float
+) -> None:
+    days = [
+        sensed(late_s, 1, motor_s=motor_s),
+        sensed(late_s, 2, 6, loaded=True, motor_s=motor_s),
+    ]
+    found = identify(days, chain(), SETTINGS)
+    for one in found.prepared:
+        assert one.joint_delay is not None
+        assert one.delay is not None
+        assert one.joint_delay.seconds == pytest.approx(late_s, abs=max(4.0 * one.joint_delay.std, 1e-4))
+        assert one.joint_delay.std < 3e-4
+        assert one.delay.seconds == pytest.approx(motor_s, abs=4.0 * one.delay.std)
+        assert not one.warnings
+    z = (found.estimate.values - true_base(found)) / found.estimate.std
+    assert np.mean(np.abs(z) < 2.0) > 0.9
+    assert np.max(np.abs(z)) < 4.5
+    assert found.model.provenance["signals"]["joint_delay_s"] == pytest.approx(late_s, abs=3e-4)
+    shown = "ahead of the positions by" if late_s < 0.0 else "joint torques late by"
+    assert shown in found.summary()
+    further = sensed(late_s, 3, 7, motor_s=motor_s)
+    blind = identify(days, chain(), replace(SETTINGS, signals=replace(SETTINGS.signals, joint_delay_s=0.0)))
+    errors = [validate(one.model, [further]).scores[0].relative["joint"] for one in (found, blind)]
+    assert errors[0] < 0.9 * errors[1]
+
+
+def test_punctual_joint_torques_are_not_late_and_cost_no_certainty() -> None:
+    days = [sensed(0.0, 1), sensed(0.0, 2, 6, loaded=True)]
+    found = identify(days, chain(), SETTINGS)
+    known = identify(days, chain(), replace(SETTINGS, signals=replace(SETTINGS.signals, joint_delay_s=0.0)))
+    for one in found.prepared:
+        assert one.joint_delay is not None
+        assert one.joint_delay.seconds == 0.0
+        assert 0.0 < one.joint_delay.std < 2e-4
+    np.testing.assert_allclose(found.estimate.values, known.estimate.values)
+    assert np.all(found.estimate.std >= known.estimate.std * (1.0 - 1e-9))
+    assert np.median(found.estimate.std / known.estimate.std) < 1.1
+
+
+def test_joints_that_disagree_tell_no_delay() -> None:
+    found = identify([sensed(0.0, 1)], chain(), SETTINGS)
+    groups = []
+    for place, group in enumerate(found.problem.groups):
+        slope = next(one.columns[place] for one in found.problem.nuisances if place in one.columns)
+        own = (0.004 if group.joint == "A1" else -0.004) if group.side == "joint" else 0.0
+        groups.append(replace(group, target=group.target - own * slope))
+    delay = delays_from_model(replace(found.problem, groups=tuple(groups)), {0: "joint"}, {0: 0.0})[0]
+    assert delay.disagreement > 3.0
+    assert (delay.seconds, delay.std) == (0.0, 0.0)
+    assert str(delay) == "not late (the joints disagree)"
+
+
+def test_torques_of_an_arm_at_rest_have_no_delay_to_tell() -> None:
+    rows = estimated(0.0).problem
+    still = replace(
+        rows,
+        nuisances=tuple(
+            replace(one, columns={k: 0.0 * column for k, column in one.columns.items()})
+            for one in rows.nuisances
+        ),
+    )
+    with pytest.raises(DataError, match="changes with its delay"):
+        delays_from_model(still, {0: "motor"}, {0: 0.0})
