@@ -131,7 +131,7 @@ def session(
             states[0][:, joint], states[1][:, joint], states[2][:, joint] = 0.1, 0.0, 0.0
         return states
 
-    q, qd, qdd = motion(time)
+    q = motion(time)[0]
     joint_torque, _ = torques(*motion(time - sensors.joint_delay_s), loaded)
     position = q + sensors.position * random.normal(size=q.shape)
     joint_torque = joint_torque + sensors.joint * correlated(random, q.shape, dt, sensors.correlation_s)
