@@ -1,6 +1,7 @@
 """Settings that hold for all tests."""
 
 import fcntl
+import gc
 import os
 import shutil
 import signal
@@ -25,6 +26,19 @@ settings.load_profile("project")
 # A shell starts what runs in its background with Ctrl-C ignored, and children inherit that; some tests press Ctrl-C.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Half as many processes again as processors: tests of links, processes and browsers wait much of their time."""
+    return max(1, len(os.sched_getaffinity(0)) * 3 // 2)
+
+
+def pytest_collection_finish() -> None:
+    """Spare the collector of garbage the search through all modules and tests, which live to the end."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.hookimpl(tryfirst=True)
