@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -72,6 +73,12 @@ def healthy(make: Make, chain: Chain) -> Diagnosis:
     return diagnose(pair(make), chain)
 
 
+@pytest.fixture(scope="module")
+def diagnosed(make: Make, chain: Chain) -> Callable[[Callable[[Signals], None]], Diagnosis]:
+    """The diagnosis of a pair of sessions with a change, made once for all tests of it."""
+    return functools.cache(lambda change: diagnose(pair(make, change), chain))
+
+
 def test_says_nothing_where_nothing_is_wrong(healthy: Diagnosis) -> None:
     assert healthy.claims == ()
     assert healthy.unexplained == ()
@@ -98,15 +105,14 @@ def test_base_model_alone_leaves_only_noise(healthy: Diagnosis) -> None:
     ],
 )
 def test_names_cause_and_joint_first(
-    make: Make,
-    chain: Chain,
+    diagnosed: Callable[[Callable[[Signals], None]], Diagnosis],
     change: Callable[[Signals], None],
     cause: str,
     joints: tuple[int, ...],
     parameter: str,
     value: float | None,
 ) -> None:
-    found = diagnose(pair(make, change), chain)
+    found = diagnosed(change)
     first = found.claims[0]
     assert (first.cause, first.joints) == (cause, joints)
     assert first.evidence.p_value < 1e-5
@@ -132,9 +138,10 @@ def test_speed_and_exponent_are_sought_together(make: Make, chain: Chain) -> Non
         assert value.std < 0.3 * true, name
 
 
-def test_extended_model_is_an_ordinary_model(make: Make, chain: Chain) -> None:
-    sessions = pair(make, stribeck)
-    found = diagnose(sessions, chain)
+def test_extended_model_is_an_ordinary_model(
+    diagnosed: Callable[[Callable[[Signals], None]], Diagnosis],
+) -> None:
+    found = diagnosed(stribeck)
     again = read_model(_loaded(model_text(found.extended_model)))
     assert [e["cause"] for e in again.effects] == ["stribeck"]
     q = np.array([[0.1, 0.2, 0.3]])
@@ -155,7 +162,9 @@ def test_gain_is_measured_on_sessions_never_fitted(make: Make, chain: Chain) -> 
 
 
 @pytest.mark.slow
-def test_constant_payload_error_needs_the_reference(make: Make, chain: Chain, bodies: np.ndarray) -> None:
+def test_constant_payload_error_needs_the_reference(
+    make: Make, chain: Chain, bodies: np.ndarray, reference: Reference
+) -> None:
     from ident.dynamics.regressor import torque
 
     def heavier(s: Signals) -> None:
@@ -170,14 +179,13 @@ def test_constant_payload_error_needs_the_reference(make: Make, chain: Chain, bo
     alone = diagnose(sessions, chain)
     assert alone.claims == ()
     assert any("no reference" in note for note in alone.notes)
-    # Two days tell that the gains of these sensors do not change from day to day.
-    reference = commission([pair(make, seed=1), pair(make, seed=3)], chain)
     found = diagnose(sessions, chain, reference=reference)
     assert found.claims[0].cause == "payload_error"
 
 
 @pytest.fixture(scope="module")
 def reference(make: Make, chain: Chain) -> Reference:
+    """Two days tell that the gains of these sensors do not change from day to day."""
     return commission([pair(make, seed=1), pair(make, seed=3)], chain)
 
 

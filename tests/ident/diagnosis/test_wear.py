@@ -37,6 +37,11 @@ def reference(make: Make, chain: Chain) -> Reference:
     return commission([pair(make, seed=11), pair(make, seed=21)], chain)
 
 
+@pytest.fixture(scope="module")
+def of_worn_arm(make: Make, chain: Chain, reference: Reference) -> Diagnosis:
+    return diagnose(pair(make, friction(1.0)), chain, reference=reference)
+
+
 def worn(found: Diagnosis) -> dict[tuple[int, ...], dict[str, float]]:
     return {
         f.joints: {name: v.value for name, v in f.parameters.items()}
@@ -46,12 +51,12 @@ def worn(found: Diagnosis) -> dict[tuple[int, ...], dict[str, float]]:
 
 
 def test_more_friction_is_wear_of_that_joint_with_its_size(
-    make: Make, chain: Chain, reference: Reference
+    reference: Reference, of_worn_arm: Diagnosis
 ) -> None:
     model = reference.model
     healthy = model.value("Fcm2"), model.value("Fvm2")
     added = 0.6, 0.8
-    found = diagnose(pair(make, friction(1.0)), chain, reference=reference)
+    found = of_worn_arm
     sizes = worn(found)[2,]
     (finding,) = [f for f in found.findings if f.cause == "wear"]
     for name, was, more in zip(("coulomb", "viscous"), healthy, added, strict=True):
@@ -104,8 +109,8 @@ def test_a_torque_of_no_name_bends_the_parameters_and_is_no_wear(
     assert any((u.side, u.joint) == ("motor", 2) for u in (*found.nameless, *found.unexplained))
 
 
-def test_wear_is_no_part_of_the_extension(make: Make, chain: Chain, reference: Reference) -> None:
-    found = diagnose(pair(make, friction(1.0)), chain, reference=reference)
+def test_wear_is_no_part_of_the_extension(of_worn_arm: Diagnosis) -> None:
+    found = of_worn_arm
     assert not any(name.startswith("wear") for name in found.extension)
     assert all(entry["cause"] != "wear" for entry in found.extended_model.effects)
 
