@@ -274,10 +274,8 @@ def test_a_page_is_legible_fits_the_window_and_is_accessible(
         assert flaws(seen) == []
 
 
-def test_a_diagnosis_is_shown_with_its_evidence(finished: Path, tmp_path: Path, chrome: Browser) -> None:
-    folder = copy(finished, tmp_path / "diagnosed")
-    (folder / "diagnosis.json").write_text(json.dumps(DIAGNOSIS))
-    with opened(chrome, write_report(folder)) as seen:
+def test_a_diagnosis_is_shown_with_its_evidence(pages: dict[str, Path], chrome: Browser) -> None:
+    with opened(chrome, pages["report"]) as seen:
         text = seen.page.inner_text("#diagnosis")
         verdict = seen.page.locator("table.verdicts tr", has_text="diagnosis").inner_text()
     for part in (
