@@ -30,10 +30,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int | None:
-    """Half as many processes again as processors: tests of links, processes and browsers wait much of their time."""
+    """A process or two more than processors: tests of links, processes and browsers wait much of their time."""
     if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ:
         return None  # the number in it
-    return max(1, len(os.sched_getaffinity(0)) * 3 // 2)
+    processors = len(os.sched_getaffinity(0))
+    return processors + min(-(-processors // 2), 2)
 
 
 def pytest_collection_finish() -> None:
