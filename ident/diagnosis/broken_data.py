@@ -106,9 +106,8 @@ def unseen(records: Sequence[SessionRecord], chain: Chain) -> tuple[str, ...]:
     """
     stretches = [stretch for record in records for stretch in record.stretches]
     motor = np.any([np.any(s.motor_usable, axis=0) for s in stretches], axis=0)
-    joint = np.any([np.any(s.usable, axis=0) for s in stretches], axis=0)
-    if not any(record.has_effort for record in records):
-        joint = np.ones_like(joint)
+    sensed = any(record.has_effort for record in records)
+    joint = np.any([np.any(s.usable, axis=0) & sensed for s in stretches], axis=0)
     return tuple(
         f"{symbol}{j + 1}"
         for j in range(chain.n)

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ from ident.diagnosis.usual_sizes import scores, usual_sizes
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
 from ident.effects.motion import dahl
+from ident.estimation.identify import IdentificationSettings, Known, observed
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.content import Recall
@@ -231,26 +232,30 @@ def commission(
     first = recorded[0]
     # Both sides in bins long enough to average the links' ringing, for a fair comparison.
     slow = replace(settings, bin_s=max(settings.bin_s, settings.ringing_s))
-    _, tuned, _ = min(
-        (_tuned(replace(start, encoder=side), first, slow, 2) for side in sides), key=lambda t: t[0]
-    )
-    log.info("positions of the %s", tuned.encoder)
-    _, tuned, base = _tuned(tuned, first, settings, _ROUNDS)
-    several = [tuned]
-    for recordings in recorded[1:_TUNING_SETS]:
-        several.append(_tuned(tuned, recordings, settings, 1)[1])
+    told, tuned = {}, {}
+    for side in sides:
+        arm_of_side = replace(start, encoder=side)
+        told[side] = channel_delays(parts[0], arm_of_side, settings)
+        tuned[side] = _tuned(arm_of_side, first, slow, 2, told[side])
+    side = min(sides, key=lambda one: tuned[one].misfit)
+    log.info("positions of the %s", side)
+    one = _tuned(tuned[side].arm, first, settings, _ROUNDS, told[side])
+    several, late, base = [one.arm], [told[side]], one.base
+    for part, recordings in zip(parts[1:_TUNING_SETS], recorded[1:_TUNING_SETS], strict=True):
+        late.append(channel_delays(part, one.arm, settings))
+        several.append(_tuned(one.arm, recordings, settings, 1, late[-1]).arm)
     known = _middle(several)
     days = [_day(known, recordings, settings, base) for recordings in recorded]
     known = with_far_presliding(known, [day.slow_turns for day in days], [day.coulomb for day in days])
     for _ in range(_SETTLING):
         # The delay of a channel depends on the reversal of friction, so it is settled last.
         days = [_day(known, recordings, settings, base) for recordings in recorded]
-        late = {side: float(np.mean([day.late[side][0] for day in days])) for side in _CHANNELS}
-        known = replace(
-            known,
-            motor_delay_s=known.motor_delay_s + late["motor"],
-            joint_delay_s=known.joint_delay_s + late["joint"],
-        )
+        open_s = {
+            side: float(np.mean([day.late[side][0] for day in days]))
+            for side in _CHANNELS
+            if not all(side in one for one in late)
+        }
+        known = _later(known, open_s)
     known = replace(known, healthy=character(known, recorded, settings))
     days = [_day(known, recordings, settings, base) for recordings in recorded]
     null: dict[tuple[str, int], float] = {}
@@ -280,19 +285,40 @@ def commission(
     )
 
 
+class _Tuned(NamedTuple):
+    """Chi-square of a row, the arm, and the base set of its bench."""
+
+    misfit: float
+    arm: NominalArm
+    base: BaseSet
+
+
 def _tuned(
-    arm: NominalArm, recordings: Sequence[SessionRecord], settings: DiagnosisSettings, rounds: int
-) -> tuple[float, NominalArm, BaseSet]:
-    """Chi-square of a row, and the arm with stiffness, presliding and delays fitted to a set in turns.
+    arm: NominalArm,
+    recordings: Sequence[SessionRecord],
+    settings: DiagnosisSettings,
+    rounds: int,
+    late: Mapping[str, float],
+) -> _Tuned:
+    """The arm with stiffness and presliding fitted to a set in turns, and the delays that `late` does not have.
 
     They are similar near a reversal, so they need a few rounds.
     """
-    # Any delay of the channels belongs to the healthy arm.
-    wide = replace(settings, delay_tolerance_s=_LATEST_S)
+    arm = replace(
+        arm,
+        motor_delay_s=late.get("motor", arm.motor_delay_s),
+        joint_delay_s=late.get("joint", arm.joint_delay_s),
+    )
     misfit = np.inf
     for _ in range(rounds):
         bench = prepare_bench(arm, recordings, settings, None, (), fit_compliance=True)
         evidence, base = bench.evidence, bench.nominal.base
+        # An unknown delay of the channels belongs to the healthy arm, whatever it is.
+        wide = (
+            settings
+            if bench.nominal.rows.keys() <= late.keys()
+            else replace(settings, delay_tolerance_s=_LATEST_S)
+        )
         nuisance = select(bench.dictionary, evidence, wide, None).nuisance
         count = max(sum(float(m.sum()) for m in evidence.mask.values()), 1.0)
         rms = [float(np.log(v).mean()) for v in evidence.sigma.values()]
@@ -300,10 +326,55 @@ def _tuned(
         arm = replace(
             bench.nominal.arm,
             presliding=presliding_length(bench.nominal, evidence.full.values[: len(base)]),
-            motor_delay_s=arm.motor_delay_s + mean_delay(nuisance, "motor")[0],
-            joint_delay_s=arm.joint_delay_s + mean_delay(nuisance, "joint")[0],
         )
-    return misfit, arm, base
+        arm = _later(arm, {side: mean_delay(nuisance, side)[0] for side in _CHANNELS if side not in late})
+    return _Tuned(misfit, arm, base)
+
+
+def _later(arm: NominalArm, by: Mapping[str, float]) -> NominalArm:
+    """The arm with channels later by so much [s]."""
+    return replace(
+        arm,
+        motor_delay_s=arm.motor_delay_s + by.get("motor", 0.0),
+        joint_delay_s=arm.joint_delay_s + by.get("joint", 0.0),
+    )
+
+
+def channel_delays(
+    sessions: Sequence[Session], arm: NominalArm, settings: DiagnosisSettings
+) -> dict[str, float]:
+    """Delays of the channels [s] as `identify` finds them: from rows away from reversals, where presliding, which
+    looks like a delay, has no part. Without those that the rows do not tell.
+    """
+    springs = None
+    if arm.encoder == "link" and np.any(arm.compliance > 0.0):
+        springs = tuple((1.0 / np.maximum(arm.compliance, 1e-12)).tolist())
+    wanted = IdentificationSettings(
+        model=2 if any(session.motor is not None for session in sessions) else 1,
+        estimator="wls",
+        signals=replace(settings.signals, stiffness_nm_rad=springs),
+        coulomb=settings.law,
+        couplings=arm.couplings,
+        essential=None,
+    )
+    known = Known(signal_reasons=("signal settings of the diagnosis",))
+    try:
+        prepared = observed(sessions, arm.chain, wanted, known=known).prepared
+    except DataError as error:
+        log.info("no delays from rows away from reversals: %s", error)
+        return {}
+    delays = {"motor": [one.delay for one in prepared], "joint": [one.joint_delay for one in prepared]}
+    told = {
+        side: [(one.estimate, one.std) for one in own if one is not None and one.by_joint and one.std > 0.0]
+        for side, own in delays.items()
+    }
+    return {side: _mean(values) for side, values in told.items() if values}
+
+
+def _mean(values: Sequence[tuple[float, float]]) -> float:
+    """Weighted mean of values with standard deviations."""
+    means, stds = np.array(values).T
+    return float(np.average(means, weights=stds**-2.0))
 
 
 def _middle(arms: Sequence[NominalArm]) -> NominalArm:

@@ -1,0 +1,60 @@
+"""The healthy arm of motor torques without joint torques beside them: friction at reversals, delay, wear."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ident.diagnosis import Reference, commission, diagnose
+from ident.dynamics.kinematics import Chain
+from ident.effects.motion import dahl
+from lwr_driver.session import Session
+
+Make = Callable[..., Session]
+Signals = dict[str, np.ndarray]
+
+LENGTH, LATE_S = 4e-3, 3e-3
+
+
+def turning(more: float = 0.0) -> Callable[[Signals], None]:
+    """Friction of the drives that turns over `LENGTH`, `more` of it in joint 2, and torques late by `LATE_S`."""
+
+    def change(s: Signals) -> None:
+        for j in range(3):
+            along = np.ascontiguousarray(np.cumsum(s["qd"][:, j]) * (s["time"][1] - s["time"][0]))
+            state = dahl(along, LENGTH, float(np.sign(s["qd"][0, j])))
+            s["motor"][:, j] += 1.5 * (state - np.sign(s["qd"][:, j])) + (more * state if j == 1 else 0.0)
+            s["motor"][:, j] = np.interp(s["time"] - LATE_S, s["time"], s["motor"][:, j])
+
+    return change
+
+
+def alone(make: Make, seed: int, more: float = 0.0) -> list[Session]:
+    made = [make("a.mcap", seed, turning(more)), make("b.mcap", seed + 1, turning(more), 1)]
+    return [replace(s, joint=replace(s.joint, effort=s.joint.effort[:, :0])) for s in made]
+
+
+@pytest.fixture(scope="module")
+def reference(make: Make, chain: Chain) -> Reference:
+    return commission([alone(make, 11), alone(make, 21)], chain)
+
+
+def test_the_healthy_drives_turn_over_their_path_and_are_late_by_their_delay(reference: Reference) -> None:
+    assert reference.presliding is not None
+    np.testing.assert_allclose(reference.presliding, LENGTH, rtol=0.2)
+    assert reference.motor_delay_s == pytest.approx(LATE_S, abs=5e-4)
+
+
+def test_more_friction_is_wear_of_its_joint(make: Make, chain: Chain, reference: Reference) -> None:
+    assert not diagnose(alone(make, 31), chain, reference=reference).findings
+    findings = diagnose(alone(make, 41, 0.6), chain, reference=reference).findings
+    (found,) = [one for one in findings if one.cause == "wear"]
+    assert found.joints == (2,)
+    # Friction of link and drive are one without joint torques: 0.1 and 1.5 Nm.
+    share = found.parameters["coulomb"]
+    assert share.value == pytest.approx(0.6 / 1.6, abs=3.0 * share.std)
+    assert share.std < 0.1
+    assert all(one.confidence < found.confidence for one in findings if one is not found)
