@@ -275,7 +275,7 @@ def commission(
                 mean[shape] = mean.get(shape, 0.0) + value / len(parts)
         log.info("healthy set %d of %d", number + 1, len(parts))
     found = _reference(days, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
-    provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals)}
+    provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals) | known.delays}
     return replace(
         found,
         model=replace(found.model, provenance=provenance),

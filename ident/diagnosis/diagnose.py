@@ -89,7 +89,10 @@ def diagnose(
     everything = sorted([*sessions, *test], key=lambda s: s.start)
     held = {id(s) for s in test}
     known = None if reference is None else signal_settings(reference.model)
-    settings = settings if known is None else replace(settings, signals=known)
+    if known is not None:
+        # Of the reference's sessions, not of these.
+        known = replace(known, motor_delay_s="estimate", joint_delay_s="estimate")
+        settings = replace(settings, signals=known)
     couplings, recall = () if arm is None else arm.couplings, Recall()
     broken = broken_channels(everything, chain, settings.signals, couplings, recall=recall)
     with blamed(broken, chain.joint_names):

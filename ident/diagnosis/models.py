@@ -70,11 +70,7 @@ def fitted_models(
     provenance: dict[str, Any] = {
         "sessions": [r.name for r in nominal.recordings if not r.test],
         "estimator": "diagnosis",
-        SIGNALS: signals_entry(task.settings.signals)
-        | {
-            "motor_delay_s": nominal.arm.motor_delay_s,
-            "joint_delay_s": nominal.arm.joint_delay_s,
-        },
+        SIGNALS: signals_entry(task.settings.signals) | nominal.arm.delays,
     }
     structure = replace(nominal.structure, coulomb=task.settings.law or nominal.structure.coulomb)
     base = DynamicModel(

@@ -91,6 +91,11 @@ class NominalArm:
     couplings: tuple[Coupling, ...] = ()
     healthy: tuple[Mapping[str, Any], ...] = ()
 
+    @property
+    def delays(self) -> dict[str, float]:
+        """Delays of the channels [s], as in the signal settings of a model."""
+        return {"motor_delay_s": self.motor_delay_s, "joint_delay_s": self.joint_delay_s}
+
     def slip(self, speed: Floats, dt: float) -> Floats:
         """Coulomb friction of the drives over its level for motor speeds (N, n) [rad/s]: Dahl's state, or the sum of
         two of them (Maxwell slip: asperities of several lengths side by side)."""

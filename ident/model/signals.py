@@ -38,11 +38,11 @@ def signals_entry(settings: SignalSettings, prepared: Sequence[PreparedSession] 
     }
     for name, found in late.items():
         delays = [delay for delay in found if delay is not None]
+        # Without a deviation it is stated, or not told by this session.
+        told = [delay for delay in delays if delay.std > 0.0]
         if delays:
-            exact = [delay.seconds for delay in delays if not delay.std > 0.0]
-            weights = [1.0] * len(exact) if exact else [delay.std**-2 for delay in delays]
-            values = exact or [delay.seconds for delay in delays]
-            entry[name] = float(np.average(values, weights=weights))
+            weights = [delay.std**-2 for delay in told] or None
+            entry[name] = float(np.average([delay.seconds for delay in told or delays], weights=weights))
     return entry
 
 

@@ -11,7 +11,8 @@ import pytest
 from fri.errors import ConfigurationError
 from ident.estimation import IdentificationSettings, identify, signals_for, validate
 from ident.model.model_file import read_model, write_model
-from ident.model.signals import signal_settings
+from ident.model.signals import signal_settings, signals_entry
+from ident.rows.delay import Delay
 from ident.rows.filters import SignalSettings
 
 
@@ -29,6 +30,16 @@ def test_a_model_knows_how_its_sessions_were_filtered_and_timed(found: Any, tmp_
     assert (signals.cutoff_hz, signals.decimate_hz, signals.standstill_rad_s) == (8.0, 1.5, 3e-3)
     delays = [session.delay for session in found.prepared]
     assert min(d.seconds for d in delays) <= signals.motor_delay_s <= max(d.seconds for d in delays)
+
+
+def test_a_session_that_tells_no_delay_has_no_part_in_that_of_the_model(found: Any) -> None:
+    one, other = found.prepared
+    told = replace(one, joint_delay=Delay(0.01, 1e-4, "from the base model"))
+    untold = replace(other, joint_delay=Delay(0.0, 0.0, "the joints disagree"))
+    assert signals_entry(SignalSettings(), [told, untold])["joint_delay_s"] == pytest.approx(0.01)
+    assert signals_entry(SignalSettings(), [untold, untold])["joint_delay_s"] == 0.0
+    stated = replace(one, joint_delay=Delay(0.004, 0.0, "stated"))
+    assert signals_entry(SignalSettings(), [stated, stated])["joint_delay_s"] == pytest.approx(0.004)
 
 
 def test_validation_takes_the_settings_and_the_delay_of_the_model(found: Any, bench: Any) -> None:
