@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -26,6 +27,8 @@ logger = logging.getLogger(__name__)
 
 # Estimates of a delay by the base model, each at the one before, at most.
 _DELAY_STEPS = 4
+# Sessions whose delays are estimated together: each has columns of its own, which would grow with their square.
+_TOGETHER = 4
 # Change of a delay between two of them that is none, in standard deviations.
 _SETTLED = 0.3
 # Change of a delay that rows do not feel, as a share of the time between them: 0.2 ms for rows of the paper's 2 Hz.
@@ -108,20 +111,35 @@ def with_delays(
 ) -> list[SessionRows]:
     """The rows with the delays that the base model tells: of joint torques, or of motor torques alone.
 
-    They come from rows at the delays found so far.
-
     of : session and payload of each. signals : of the estimate. make : `session_rows` with the rest of its arguments.
     """
-    found = list(made)
     setting = {"joint": "joint_delay_s", "motor": "motor_delay_s"}
-    sides = {
-        k: one.side
+
+    def at(number: int, delay_s: float) -> SessionRows:
+        stated: dict[str, Any] = {setting[made[number].side]: delay_s}
+        return make(*of[number], signals=replace(signals, **stated))
+
+    untold = [
+        k
         for k, one in enumerate(made)
         if one.delay is not None and getattr(signals, setting[one.side]) == "estimate"
-    }
+    ]
+    found = list(made)
+    for first in range(0, len(untold), _TOGETHER):
+        some = untold[first : first + _TOGETHER]
+        told = _told([made[k] for k in some], [partial(at, k) for k in some])
+        for k, rows in zip(some, told, strict=True):
+            found[k] = rows
+            logger.info("%s: %s torques %s", rows.prepared.name, rows.side, rows.delay)
+    return found
+
+
+def _told(made: Sequence[SessionRows], at: Sequence[Callable[[float], SessionRows]]) -> list[SessionRows]:
+    """The rows of some sessions with their delays, each step from rows at the delays before. at : rows at a delay."""
+    found, sides = list(made), {k: one.side for k, one in enumerate(made)}
     delays: dict[int, Delay] = {}
-    for _ in range(_DELAY_STEPS if sides else 0):
-        now = {k: delay.seconds for k in sides if (delay := found[k].delay) is not None}
+    for _ in range(_DELAY_STEPS):
+        now = {k: one.delay.seconds for k, one in enumerate(found) if one.delay is not None}
         try:
             delays = delays_from_model(stack([one.problem for one in found]), sides, now)
         except DataError as error:
@@ -131,9 +149,7 @@ def with_delays(
         for k, delay in delays.items():
             rest = delay.seconds - now[k]
             if abs(rest) > max(_SETTLED * delay.std, _FELT * found[k].prepared.row_time_s):
-                moving = True
-                stated: dict[str, Any] = {setting[sides[k]]: delay.seconds}
-                found[k] = make(*of[k], signals=replace(signals, **stated)).late(delay)
+                moving, found[k] = True, at[k](delay.seconds).late(delay)
             else:
                 std = float(np.hypot(delay.std, rest))
                 found[k] = found[k].late(replace(delay, seconds=now[k], std=std))
@@ -144,9 +160,6 @@ def with_delays(
         if not fits_better(after, before, sides):
             for k, delay in delays.items():
                 std = float(np.hypot(delay.std, delay.seconds))
-                found[k] = made[k].late(
-                    replace(delay, seconds=0.0, std=std, how="with it no row fits better")
-                )
-    for k in sides:
-        logger.info("%s: %s torques %s", found[k].prepared.name, sides[k], found[k].delay)
+                none = replace(delay, seconds=0.0, std=std, how="with it no row fits better")
+                found[k] = made[k].late(none)
     return found

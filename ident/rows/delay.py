@@ -45,6 +45,8 @@ logger = logging.getLogger(__name__)
 DELAY_HZ, DELAY_DB = 5.0, 40.0
 _SYMBOLS = ("Ia", "Fvm", "Fcm", "offm")
 _STEPS = 12
+# Rows of a joint in use for a delay, so that memory does not grow with the session: seven minutes of the paper's rows.
+_MOST_ROWS = 2000
 # Least share of a column that no column before has, for it to count.
 _SHOWN = 1e-6
 _GRID = 41
@@ -245,16 +247,16 @@ def delays_from_model(
         (record, joint)
         for record, side in sides.items()
         for joint in dict.fromkeys(
-            problem.groups[k].joint
-            for k in used
-            if problem.groups[k].record == record and problem.groups[k].side == side and np.any(slopes[k])
+            group.joint
+            for k, group in used.items()
+            if group.record == record and group.side == side and np.any(slopes[k])
         )
     ]
     groups = []
-    for k in used:
-        group, late = problem.groups[k], np.zeros((len(problem.groups[k].target), len(places)))
+    for k, group in used.items():
+        late = np.zeros((len(group.target), len(places)))
         if (group.record, group.joint) in places:
-            late[:, places.index((group.record, group.joint))] = -slopes[k]
+            late[:, places.index((group.record, group.joint))] = -slopes[k][: len(late)]
         groups.append(replace(group, matrix=np.hstack([group.matrix, late])))
     base = len(problem.names)
     names = (*problem.names, *(f"delay {record} {joint}" for record, joint in places))
@@ -285,8 +287,7 @@ def fits_better(after: Problem, before: Problem, sides: Mapping[int, str]) -> bo
     """Whether the base model fits the rows of these sides better at other delays, by the likelihood of all joints."""
     squares = []
     for problem in (after, before):
-        groups = tuple(problem.groups[k] for k in _used(problem, sides))
-        own = replace(problem, groups=groups, nuisances=())
+        own = replace(problem, groups=tuple(_used(problem, sides).values()), nuisances=())
         own = own.select(_shown(own))
         rest = own.residuals(weighted_solution(own)[0])
         squares.append(
@@ -296,9 +297,20 @@ def fits_better(after: Problem, before: Problem, sides: Mapping[int, str]) -> bo
     return float(np.log(squares[0]) @ rows) < float(np.log(squares[1]) @ rows)
 
 
-def _used(problem: Problem, sides: Mapping[int, str]) -> list[int]:
-    """Row groups of these sides of these records, and all of other records."""
-    return [k for k, group in enumerate(problem.groups) if group.side == sides.get(group.record, group.side)]
+def _used(problem: Problem, sides: Mapping[int, str]) -> dict[int, RowGroup]:
+    """Row groups of these sides of these records, and all of other records, by their number, no more than the first
+    rows of each."""
+    found = {}
+    for k, group in enumerate(problem.groups):
+        if group.side == sides.get(group.record, group.side):
+            part = slice(_MOST_ROWS)
+            found[k] = replace(
+                group,
+                matrix=group.matrix[part],
+                target=group.target[part],
+                time_index=group.time_index[part],
+            )
+    return found
 
 
 def _shown(problem: Problem) -> list[int]:
