@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +11,13 @@ import pytest
 from fri.errors import DataError
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.validate import validate
-from ident.rows.delay import delays_from_model
+from ident.estimators.problem import Problem
+from ident.rows.delay import Delay, delays_from_model
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session, true_base
 
+session_rows = importlib.import_module("ident.estimation.session_rows")
+delay_module = importlib.import_module("ident.rows.delay")
 SETTINGS = IdentificationSettings(estimator="wls", essential=None)
 
 
@@ -108,6 +112,27 @@ def test_punctual_joint_torques_are_not_late_and_cost_no_certainty() -> None:
     np.testing.assert_allclose(found.estimate.values, known.estimate.values)
     assert np.all(found.estimate.std >= known.estimate.std * (1.0 - 1e-9))
     assert np.median(found.estimate.std / known.estimate.std) < 1.1
+
+
+def test_delays_of_many_long_sessions_come_from_a_few_and_their_first_rows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(session_rows, "_TOGETHER", 1)
+    monkeypatch.setattr(delay_module, "_MOST_ROWS", 60)
+    asked = []
+    whole = session_rows.delays_from_model
+
+    def counted(problem: Problem, sides: dict[int, str], before: dict[int, float]) -> dict[int, Delay]:
+        asked.append((len(problem.record_names), max(len(group.target) for group in problem.groups)))
+        return whole(problem, sides, before)
+
+    monkeypatch.setattr(session_rows, "delays_from_model", counted)
+    found = identify([sensed(0.006, 1), sensed(-0.002, 2, 6, loaded=True)], chain(), SETTINGS)
+    assert {count for count, _ in asked} == {1}
+    assert max(rows for _, rows in asked) > 60
+    for one, late_s in zip(found.prepared, (0.006, -0.002), strict=True):
+        assert one.joint_delay is not None
+        assert one.joint_delay.seconds == pytest.approx(late_s, abs=max(4.0 * one.joint_delay.std, 2e-4))
 
 
 def test_joints_that_disagree_tell_no_delay() -> None:
