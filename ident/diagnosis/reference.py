@@ -21,7 +21,7 @@ from ident.diagnosis.evidence import Floats
 from ident.diagnosis.nominal import GAIN_STD
 from ident.diagnosis.usual_sizes import Healthy, UsualSize, scatter_limits
 from ident.dynamics.base_set import BaseSet
-from ident.dynamics.parameters import PER_LINK
+from ident.dynamics.parameters import LINK_FRICTION, PER_LINK, split_name
 from ident.effects import EFFECTS, NAMELESS
 from ident.effects.nameless import KNOTS
 from ident.estimators.estimate import fisher_limit
@@ -149,6 +149,11 @@ class Reference:
             raise ConfigurationError(
                 f"the reference's `provenance.{_KEY}` cannot be read ({error}); commission the arm again"
             ) from error
+        if set(noise) == {"motor"} and any(symbol_of(name) == "Fcl" for name in model.names):
+            raise ConfigurationError(
+                "the reference is of motor torques alone and has its friction at the links, as earlier versions made "
+                "it: there it neither turns over a path nor wears; commission the arm again"
+            )
         if compliance.shape != (n,):
             raise ConfigurationError(
                 f"the reference's compliance has {compliance.size} entries for {n} joints; commission again"
@@ -403,12 +408,20 @@ def shared(
 
 
 def _combination(base: BaseSet, k: int, other: set[str]) -> tuple[tuple[str, float], ...]:
-    """Names and factors of a base parameter's sum, the payloads' by their names; `other` ones by no name in use."""
-    row = base.matrix[k]
-    return tuple(
-        (_with_payload(base, int(c), other), round(float(row[c]), 6))
-        for c in np.flatnonzero(np.abs(row) > 1e-9)
-    )
+    """Names and factors of a base parameter's sum, the payloads' by their names; `other` ones by no name in use.
+
+    Friction of a drive has that of its link in it, where that is left out for want of joint torques.
+    """
+    row, structure = base.matrix[k], base.structure
+    found = []
+    for column in np.flatnonzero(np.abs(row) > 1e-9).tolist():
+        factor = round(float(row[column]), 6)
+        found.append((_with_payload(base, column, other), factor))
+        symbol, link, *_ = split_name(structure.names[column])
+        beside = column - len(LINK_FRICTION) if symbol in ("Fvm", "Fcm", "offm") else column
+        if link <= structure.chain.n and not structure.active[beside]:
+            found.append((structure.names[beside], factor))
+    return tuple(sorted(found))
 
 
 def _with_payload(base: BaseSet, column: int, other: set[str]) -> str:

@@ -30,7 +30,8 @@ from fri.errors import ConfigurationError
 Floats = NDArray[np.float64]
 
 INERTIAL = ("XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M")
-DRIVE = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")
+LINK_FRICTION = ("Fvl", "Fcl", "offl")
+DRIVE = ("Ia", *LINK_FRICTION, "Fvm", "Fcm", "offm")
 PER_LINK = INERTIAL + DRIVE
 
 # Positions of our ten parameters in pinocchio's order m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz.

@@ -35,13 +35,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.parameters import DRIVE, INERTIAL, PER_LINK, Floats, parameter_names, split_name, unit
+from ident.dynamics.parameters import (
+    DRIVE,
+    INERTIAL,
+    LINK_FRICTION,
+    PER_LINK,
+    Floats,
+    parameter_names,
+    split_name,
+    unit,
+)
 from ident.dynamics.regressor import check_states, fill_rigid
 
 Side = Literal["motor", "joint", "difference"]
 MODEL_SIDES: dict[int, tuple[Side, ...]] = {1: ("joint",), 2: ("motor", "joint"), 3: ("difference",)}
 
-_JOINT_TERMS = frozenset({"Fvl", "Fcl", "offl"})
+_JOINT_TERMS = frozenset(LINK_FRICTION)
 _MOTOR_TERMS = frozenset({"Ia", "Fvm", "Fcm", "offm"})
 # The signal multiplied by each drive parameter, in the order of the atoms after the rigid ones.
 _SIGNALS = ("qdd", "qd", "sign", "one")

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrs, dpstrf
 
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.parameters import INERTIAL, Floats
+from ident.dynamics.parameters import INERTIAL, LINK_FRICTION, Floats
 from ident.dynamics.regressor import rigid_regressor, torque
 from ident.dynamics.structure import Coupling
 from ident.rows.content import Recall
@@ -234,8 +234,8 @@ class Redundancy:
     def place(self, symbol: str, joint: int) -> int:
         """Column of a drive parameter of a joint (from 0)."""
         first = _BODY * (self.chain.n + len(self.payloads))
-        if symbol in ("Fvl", "Fcl", "offl"):
-            return first + _JOINT * joint + ("Fvl", "Fcl", "offl").index(symbol)
+        if symbol in LINK_FRICTION:
+            return first + _JOINT * joint + LINK_FRICTION.index(symbol)
         first += _JOINT * self.chain.n if "joint" in self.sides else 0
         return first + _MOTOR * joint + ("Ia", "Fvm", "Fcm", "offm").index(symbol)
 

@@ -8,9 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fri.errors import ConfigurationError
 from ident.diagnosis import Reference, commission, diagnose
+from ident.diagnosis.reference import shared
+from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import LINK_FRICTION
+from ident.dynamics.structure import Condition, ModelStructure
 from ident.effects.motion import dahl
+from ident.model import DynamicModel
 from lwr_driver.session import Session
 
 Make = Callable[..., Session]
@@ -58,3 +64,27 @@ def test_more_friction_is_wear_of_its_joint(make: Make, chain: Chain, reference:
     assert share.value == pytest.approx(0.6 / 1.6, abs=3.0 * share.std)
     assert share.std < 0.1
     assert all(one.confidence < found.confidence for one in findings if one is not found)
+
+
+def test_friction_is_compared_with_that_of_sessions_with_the_same_torques(chain: Chain) -> None:
+    both = numeric_base(ModelStructure(chain, 2), (Condition(None, ("motor", "joint")),))
+    of_drives = numeric_base(ModelStructure(chain, 2, without=LINK_FRICTION), (Condition(None, ("motor",)),))
+    of_links = numeric_base(ModelStructure(chain, 2), (Condition(None, ("motor",)),))
+
+    def compared(a: BaseSet, b: BaseSet) -> set[str]:
+        return {a.names[k] for k, _ in shared(a, b, {}, {})}
+
+    assert "Fcm2" in compared(of_drives, of_drives)
+    assert "Fcm2" in compared(of_drives, of_links)
+    # The drive's friction alone is not that of drive and link.
+    assert {name for name in compared(of_drives, both) if name.startswith("F")} == set()
+
+
+def test_a_reference_with_the_friction_of_its_drives_at_the_links_is_made_anew(
+    chain: Chain, reference: Reference
+) -> None:
+    base = numeric_base(ModelStructure(chain, 2), (Condition(None, ("motor",)),))
+    values = np.ones(len(base))
+    model = DynamicModel("arm", base.structure, base.names, values, None, base, reference.stored())
+    with pytest.raises(ConfigurationError, match="commission the arm again"):
+        Reference.of(model)
