@@ -65,7 +65,7 @@ _DECISIVE = 25.0
 DISAGREEMENT = 3.0
 """Scatter of seven joints over their standard deviations, exceeded once in a thousand healthy sessions, for deviations
 that are a third too small."""
-# A delay is common to joints that disagree where it is so many times their scatter.
+# Least delay of joint torques, or of joints that disagree, over the scatter of the joints: each shows it by itself.
 _ALIKE = 3.0
 # A delay within this many standard deviations of zero is not told apart from zero.
 _DISTINCT = 1.96
@@ -275,10 +275,12 @@ def delays_from_model(
         delay = _together(
             list(mine), before[record] + fit.values[own], fit.std[own], "from the base model", earliest
         )
-        scatter = delay.std * len(own) ** 0.5
-        if delay.disagreement > DISAGREEMENT and _ALIKE * scatter > abs(delay.seconds):
-            # What the base model lacks is no delay.
-            delay = replace(delay, seconds=0.0, std=0.0, how="the joints disagree")
+        disagree = delay.disagreement > DISAGREEMENT
+        if abs(delay.estimate) < _ALIKE * delay.std * len(own) ** 0.5 and (disagree or side == "joint"):
+            # What the base model lacks looks late, too, in each joint by another time.
+            std = 0.0 if disagree else float(np.hypot(delay.std, delay.seconds))
+            how = "the joints disagree" if disagree else delay.how
+            delay = replace(delay, seconds=0.0, std=std, how=how)
         found[record] = delay
     return found
 
