@@ -18,6 +18,7 @@ import numpy as np
 from fri.errors import LwrError
 from ident.diagnosis.recording import SessionRecord
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import LINK_FRICTION
 from ident.dynamics.structure import Coupling
 from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
@@ -111,7 +112,7 @@ def unseen(records: Sequence[SessionRecord], chain: Chain) -> tuple[str, ...]:
     return tuple(
         f"{symbol}{j + 1}"
         for j in range(chain.n)
-        for seen, symbols in ((motor[j], ("Ia", "Fvm", "Fcm", "offm")), (joint[j], ("Fvl", "Fcl", "offl")))
+        for seen, symbols in ((motor[j], ("Ia", "Fvm", "Fcm", "offm")), (joint[j], LINK_FRICTION))
         if not seen
         for symbol in symbols
     )

@@ -23,7 +23,7 @@ from numba import njit
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.parameters import DRIVE, INERTIAL
+from ident.dynamics.parameters import DRIVE, INERTIAL, LINK_FRICTION
 from ident.dynamics.urdf import read_urdf
 from ident.excitation.motions import Array, Samples
 from ident.excitation.sweep import forward
@@ -34,7 +34,7 @@ BODY = INERTIAL
 _NO_COLUMNS = np.zeros(0, dtype=np.int64)
 # drive parameters: place of the signal among qdd, qd, sign(qd), 1; members of the joint row; columns of `drives`
 DRIVE_SIGNAL = {"Ia": 0, "Fvl": 1, "Fvm": 1, "Fcl": 2, "Fcm": 2, "offl": 3, "offm": 3}
-JOINT_SIDE = ("Fvl", "Fcl", "offl")
+JOINT_SIDE = LINK_FRICTION
 IA, FVL, FCL, OFFL, FVM, FCM, OFFM = range(7)
 
 

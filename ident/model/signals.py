@@ -32,17 +32,12 @@ def signals_entry(settings: SignalSettings, prepared: Sequence[PreparedSession] 
     entry = dataclasses.asdict(settings)
     if prepared:
         entry["cutoff_hz"] = float(np.median([one.cutoff_hz for one in prepared]))
-    late = {
-        "motor_delay_s": [one.delay for one in prepared],
-        "joint_delay_s": [one.joint_delay for one in prepared],
-    }
-    for name, found in late.items():
-        delays = [delay for delay in found if delay is not None]
+    for name in dict.fromkeys(name for one in prepared for name in one.delays):
+        delays = [one.delays[name] for one in prepared if name in one.delays]
         # Without a deviation it is stated, or not told by this session.
         told = [delay for delay in delays if delay.std > 0.0]
-        if delays:
-            weights = [delay.std**-2 for delay in told] or None
-            entry[name] = float(np.average([delay.seconds for delay in told or delays], weights=weights))
+        weights = [delay.std**-2 for delay in told] or None
+        entry[name] = float(np.average([delay.seconds for delay in told or delays], weights=weights))
     return entry
 
 

@@ -54,8 +54,8 @@ _GRID = 41
 _KNOWN = 0.4
 # Rows of a joint needed for a delay of its own.
 _LEAST_ROWS = 16
-SHIFT_S = 1e-3
-"""Change of a delay for the derivative by it [s]."""
+# Change of a delay for the derivative by it [s].
+_SHIFT_S = 1e-3
 # Largest Fvm / stiffness of strain-wave joints, 17 Nm s/rad over 8 kNm/rad: so early an elastic joint looks [s].
 _ELASTIC_S = 2e-3
 # Standard deviation of a stated compliance, as a share of it: within a class of arms stiffness differs by 1.5 times.
@@ -457,7 +457,9 @@ def _newton(
 ) -> tuple[Floats, Floats, Floats]:
     """Gauss-Newton step of the delay (1,), or of each joint's own (J,), standard deviations [s], and Fvm (J,)."""
     parts = [part.masked(delay) for part in parts]
-    here, later, earlier = ([part.at(delay + shift) for part in parts] for shift in (0.0, SHIFT_S, -SHIFT_S))
+    here, later, earlier = (
+        [part.at(delay + shift) for part in parts] for shift in (0.0, _SHIFT_S, -_SHIFT_S)
+    )
     count = len(joints) if separate else 1
     groups = []
     # A joint moving one way only cannot tell Coulomb friction from an offset.
@@ -485,7 +487,7 @@ def _newton(
             )
             matrix = np.zeros((len(rows), width + count))
             matrix[:, first : first + len(used[j])] = here[record][0][rows, j][:, used[j]]
-            matrix[:, width + (place if separate else 0)] = -slope / (2.0 * SHIFT_S)
+            matrix[:, width + (place if separate else 0)] = -slope / (2.0 * _SHIFT_S)
             groups.append(RowGroup(str(j), "difference", record, matrix, here[record][1][rows, j], rows))
         first += len(used[j])
     titles = [f"{_SYMBOLS[k]} {j}" for j in joints for k in used[j]]

@@ -91,7 +91,7 @@ def observe(
     groups: list[RowGroup] = []
     nuisances: list[Nuisance] = []
     for number, (session, payload) in enumerate(zip(sessions, payloads, strict=True)):
-        slopes: dict[bool, dict[int, Floats]] = {False: {}, True: {}}
+        slopes: dict[str, dict[int, Floats]] = {"motor": {}, "joint": {}}
         by_side = {side: _Collected(session) for side in structure.sides}
         for passage in session.passages:
             for side, rows in by_side.items():
@@ -100,11 +100,11 @@ def observe(
                     rows.add(part)
         for side, rows in by_side.items():
             for group, slope in rows.groups(number, side):
-                slopes[side == "joint"][len(groups)] = slope
+                slopes["joint" if side == "joint" else "motor"][len(groups)] = slope
                 groups.append(group)
-        for sensed, name, delay in ((False, "motor", session.delay), (True, "joint", session.joint_delay)):
-            if delay is not None and slopes[sensed]:
-                nuisances.append(Nuisance(f"{name} delay of {session.name}", delay.std, slopes[sensed]))
+        for name, delay in (("motor", session.delay), ("joint", session.joint_delay)):
+            if delay is not None and slopes[name]:
+                nuisances.append(Nuisance(f"{name} delay of {session.name}", delay.std, slopes[name]))
     if not groups:
         raise DataError(
             f"no usable row for {' and '.join(structure.sides)} torque: every row was dropped because a "

@@ -134,9 +134,14 @@ class PreparedSession:
     @property
     def signals(self) -> SignalSettings:
         """The settings with the delays in use stated."""
-        delays = {"motor_delay_s": self.delay, "joint_delay_s": self.joint_delay}
-        stated: dict[str, Any] = {name: one.seconds for name, one in delays.items() if one is not None}
+        stated: dict[str, Any] = {name: one.seconds for name, one in self.delays.items()}
         return replace(self.settings, **stated)
+
+    @property
+    def delays(self) -> dict[str, Delay]:
+        """The delays of its torques, by their names in the settings."""
+        found = {"motor_delay_s": self.delay, "joint_delay_s": self.joint_delay}
+        return {name: one for name, one in found.items() if one is not None}
 
     @property
     def has_motor(self) -> bool:
