@@ -34,7 +34,7 @@ from ident.diagnosis.payloads import other_masses, payload_finding, with_masses
 from ident.diagnosis.recording import record, settled, usual_step
 from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
 from ident.diagnosis.result import Diagnosis, Finding
-from ident.diagnosis.selection import Claim, Selection, best_candidate
+from ident.diagnosis.selection import Claim, Selection, best_candidate, longer_turns
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.task import Baseline, Simulate, State, Task
 from ident.dynamics.kinematics import Chain
@@ -53,6 +53,8 @@ _SHIFTS = 5
 _UNIT_S = 1e-3
 # Least number of joints for a delay to be confirmed by more than one.
 _MOST_ALONE = 3
+# Rounds of the presliding lengths of these days, the factor on one that is none, and the largest one.
+_LENGTHS, _ALIKE, _USUAL_LENGTHS = 3, 1.2, 2.5
 # Largest remaining delay after a shift, as a share of the tolerance for delays.
 _IN_PLACE = 0.2
 
@@ -109,12 +111,13 @@ def diagnose(
         )
         if worthless(broken):
             return _ended(task, broken)
-        first = _first(task)
+        task, bench = _of_these_days(task)
+        first = _first(task, bench)
         others = other_masses(first.bench, reference)
         if others and reference is not None:
             # With a mass of its own it pulls at nothing else.
             task = with_masses(task, {one.payload: one.mass for one in others})
-            first = _first(task)
+            first = _first(task, _bench(task))
         state = _refined(task, _in_time(task, first))
         if reference is not None:
             state = replace(state, loads=tuple(map(payload_finding, others)))
@@ -132,10 +135,30 @@ def _ended(task: Task, broken: Sequence[BrokenChannel]) -> Diagnosis:
     return replace(conclude(task, state), findings=(), unexplained=(), data=tuple(broken))
 
 
-def _first(task: Task) -> State:
+def _bench(task: Task) -> DiagnosisBench:
+    return task.bench(task.arm, task.reference, fit_compliance=task.reference is None)
+
+
+def _of_these_days(task: Task) -> tuple[Task, DiagnosisBench]:
+    """The task with the presliding lengths of these days, and its bench: friction that turns over half or twice the
+    length is not linear in the change of it."""
+    bench, usual = _bench(task), task.arm.presliding
+    if task.reference is None or usual is None:
+        return task, bench
+    lengths = usual
+    for _ in range(_LENGTHS):
+        change = longer_turns(bench.dictionary, bench.evidence, task.settings)
+        if np.max(np.abs(change)) < np.log(_ALIKE):
+            break
+        lengths = np.clip(lengths * np.exp(change), usual / _USUAL_LENGTHS, usual * _USUAL_LENGTHS)
+        task = replace(task, arm=replace(task.arm, presliding=lengths))
+        bench = _bench(task)
+    return task, bench
+
+
+def _first(task: Task, bench: DiagnosisBench) -> State:
     """The first selection, with the noise from the best candidate's residual if neither repetition nor the healthy arm
     gives it: the limits of the healthy arm hold with its own noise."""
-    bench = task.bench(task.arm, task.reference, fit_compliance=task.reference is None)
     selection = task.select(bench)
     known = bench.repeatable or (task.reference is not None and bool(task.reference.correlated))
     if known or selection.claims:
@@ -228,7 +251,11 @@ def _rest(bench: DiagnosisBench, selection: Selection, cause: str) -> tuple[floa
     side = EFFECTS[cause].channel
     alike = (cause, PRESLIDING.cause)
     taken = [c.trial.rows for c in selection.claims if c.trial.candidate.cause not in alike]
-    tolerated = [rows for name, rows in selection.tolerated.items() if not name.startswith(f"{side} delay")]
+    tolerated = [
+        rows
+        for name, rows in selection.tolerated.items()
+        if not (name.startswith(f"{side} delay") or cause in name)
+    ]
     bench.evidence.replace([*taken, *tolerated])
     columns = bench.dictionary.rows(Candidate(EFFECTS[cause], -1), Shape(delay=_UNIT_S))
     return _delay_of(bench.evidence.score(bench.evidence.padded(columns)))

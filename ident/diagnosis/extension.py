@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
-from ident.diagnosis.evidence import Rows
+from ident.diagnosis.evidence import Floats, Rows
 from ident.diagnosis.held_out import HeldOut, held_out, interval, worse_rows
 from ident.diagnosis.probes import Remainder
 from ident.diagnosis.result import Finding, Nameless
@@ -76,12 +76,22 @@ def power_left(before: HeldOut, after: HeldOut) -> float:
     return float(np.nanmean(share))
 
 
-def torque_error(model: DynamicModel, sessions: Sequence[Session]) -> float:
-    """Torque error of a model in sessions, as `validate` measures it: the mean square over sessions and sides of the
-    relative error of all samples. Infinite without a score."""
+def torque_errors(model: DynamicModel, sessions: Sequence[Session]) -> Floats:
+    """Relative torque errors of a model by session and side, as `validate` measures them with all samples."""
     scores = validate(model, sessions, allow_seen=True, keep_going=True, known=Known()).scores
-    squares = [error**2 for score in scores for error in score.relative.values()]
-    return float(np.mean(squares)) if squares else np.inf
+    return np.array([error for score in scores for error in score.relative.values()])
+
+
+def squares_left(errors: Floats, base: Floats) -> float:
+    """Mean square of torque errors over those of the base model: each session and side by its own measure, for the
+    chance of a side with large errors is more than the whole error of another. One where the base model has none,
+    infinite where the other lacks one of them.
+    """
+    if not len(base):
+        return 1.0
+    if errors.shape != base.shape:
+        return np.inf
+    return float(np.mean((errors / np.maximum(base, 1e-12)) ** 2))
 
 
 def nameless_terms(

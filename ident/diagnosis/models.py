@@ -15,7 +15,7 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.evidence import Rows
-from ident.diagnosis.extension import Member, held_out_with, nameless_terms, torque_error
+from ident.diagnosis.extension import Member, held_out_with, nameless_terms, squares_left, torque_errors
 from ident.diagnosis.held_out import HeldOut
 from ident.diagnosis.nominal import GAIN_STD
 from ident.diagnosis.result import Finding, Nameless
@@ -127,7 +127,7 @@ def turning_friction(
         left = max(float(level[joint]) - taken, 0.0)
         longer, _ = selection.nuisance.get(f"{LENGTH} {joint + 1}", (0.0, 0.0))
         far = 0.0 if arm.far_share is None else float(arm.far_share[joint])
-        parts = [(left * (1.0 - far), float(arm.presliding[joint]) * (1.0 + longer))]
+        parts = [(left * (1.0 - far), float(arm.presliding[joint]) * float(np.exp(longer)))]
         if far and arm.far is not None:
             parts.append((left * far, float(arm.far[joint])))
         entries += [
@@ -150,14 +150,15 @@ def without_harm(
     bench, nuisance = state.bench, state.selection.nuisance_rows
     refuted: list[Finding] = []
     made = fitted_models(task, state, baseline, members, after)
-    limit, left = (torque_error(model, task.test) for model in (made.base, made.extended))
-    while members and left > limit:
+    base, extended = (torque_errors(model, task.test) for model in (made.base, made.extended))
+    left = squares_left(extended, base)
+    while members and left > 1.0:
         found = []
         for member in members:
             rest = [m for m in members if m is not member]
             held = held_out_with(bench, rest, nuisance)
             model = fitted_models(task, state, baseline, rest, held).extended
-            found.append((torque_error(model, task.test), member))
+            found.append((squares_left(torque_errors(model, task.test), base), member))
         left, worst = min(found, key=lambda pair: pair[0])
         members = [m for m in members if m is not worst]
         refuted += [worst.finding] if worst.finding is not None else []

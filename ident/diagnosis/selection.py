@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ident.diagnosis.candidates import Candidate, Dictionary, Trial
-from ident.diagnosis.evidence import Evidence, Key, Rows, Score
+from ident.diagnosis.evidence import Evidence, Floats, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.diagnosis.tolerances import HABITUAL, Tolerance, tolerances
+from ident.diagnosis.tolerances import HABITUAL, LENGTH, Tolerance, tolerances
 from ident.diagnosis.usual_sizes import Healthy
 from ident.effects import Shape
 from ident.estimators.estimate import normal_tail
@@ -46,6 +46,8 @@ _LEAST_GAIN = 10.0
 _SHAPE_ALONE = 0.7
 # Confidence in one of two causes of the same torque in these motions.
 _EITHER = 0.5
+# A change of a length over its standard deviation.
+_CERTAIN = 3.0
 # Latest sets of columns whose best shapes are kept.
 _LATEST = 6
 # Least and largest ratio of the information to that of the healthy sets: less of it makes no limit smaller, for what
@@ -145,6 +147,18 @@ def best_candidate(
     if best is None or best.score.gain < _LEAST_GAIN:
         return None
     return Selection([Claim(best, best.score)], state.nuisance, {}, state.nuisance_rows)
+
+
+def longer_turns(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings) -> Floats:
+    """Logarithms (n,) of the factors on the drives' presliding lengths in a reference, beside the other tolerated
+    deviations; 0 where it is no more than its own uncertainty."""
+    state = State(dictionary, evidence, settings)
+    state.tolerate([])
+    found = np.zeros(dictionary.nominal.arm.chain.n)
+    for joint in range(len(found)):
+        change, std = state.nuisance.get(f"{LENGTH} {joint + 1}", (0.0, 0.0))
+        found[joint] = change if abs(change) > _CERTAIN * std else 0.0
+    return found
 
 
 def _same_moment(trial: Trial, other: Trial) -> bool:
@@ -301,7 +315,15 @@ class State:
         size, limit = usual
         change = size.beyond(here)
         other = trial.score.gain - max(here.gain, 0.0)
-        return change > 0.0 and change + other > self._limit(trial.candidate, limit, size.shape)
+        # Days alike by chance have a limit below that of noise.
+        limit = max(self._limit(trial.candidate, limit, size.shape), self._least(trial.candidate, here))
+        return change > 0.0 and change + other > limit
+
+    def _least(self, candidate: Candidate, score: Score) -> float:
+        """Least gain of a claim."""
+        return candidate.effect.evidence_factor * (
+            self.settings.least_gain + 6.0 * (len(score.coefficients) - 1)
+        )
 
     def _limit(self, candidate: Candidate, limit: float, shape: str) -> float:
         """The limit of a gain in sessions with as much information on a candidate of a shape.
@@ -352,8 +374,7 @@ class State:
         gain than on healthy days."""
         score = trial.score if score is None else score
         settings = self.settings
-        strict = trial.candidate.effect.evidence_factor
-        least = strict * (settings.least_gain + 6.0 * (len(score.coefficients) - 1))
+        least = self._least(trial.candidate, score)
         if score.gain <= least:
             return False
         if healthy and not self.unusual(trial):
@@ -365,7 +386,7 @@ class State:
         least = max(least, self.usual(trial)) if healthy else least
         # A brief event is large for a moment, and small in the whole session.
         size = np.inf if trial.candidate.effect.event else score.inflation * self.concentration(trial, score)
-        needed = strict * settings.least_inflation
+        needed = trial.candidate.effect.evidence_factor * settings.least_inflation
         # A cause in few blocks cannot be significant by blocks, however large; cross-validation decides instead.
         rare = score.gain > _PLAIN * least and _PLAIN * needed < size < np.inf
         return size > needed and score.p_value < (settings.alpha_rare if rare else settings.alpha)

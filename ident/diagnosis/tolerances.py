@@ -21,8 +21,8 @@ from ident.effects.motion import ArmMotion
 _KNOWN_DELAY = 0.4
 # The same for a stiffness behind published motors.
 _KNOWN_COMPLIANCE = 0.4
-# Standard deviation of a presliding length from day to day, as a share of it.
-_LENGTH_STD = 0.2
+# Largest factor on a presliding length from day to day, and that of the two lengths of its column.
+_LONGEST, _APART = 5.0, 1.5
 
 HABITUAL = 3.0
 """Largest change from day to day, in standard deviations."""
@@ -31,7 +31,7 @@ GAIN = "gain"
 COMPLIANCE = "compliance"
 """The same for a joint's compliance."""
 LENGTH = "presliding"
-"""The same for the presliding length of a drive, a share of it."""
+"""The same for the presliding length of a drive, the logarithm of the factor on it."""
 
 
 class Tolerance(NamedTuple):
@@ -74,7 +74,7 @@ def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSe
             for j, rows in gain_rows(dictionary).items()
         ]
         found += [
-            Tolerance(f"{LENGTH} {j + 1}", rows, 1.0, HABITUAL * _LENGTH_STD, (PRESLIDING.cause, j))
+            Tolerance(f"{LENGTH} {j + 1}", rows, 1.0, np.log(_LONGEST), (PRESLIDING.cause, j))
             for j, rows in _presliding_rows(dictionary).items()
         ]
     return found
@@ -111,19 +111,17 @@ def gain_rows(dictionary: Dictionary) -> dict[int, Rows]:
 
 
 def _presliding_rows(dictionary: Dictionary) -> dict[int, Rows]:
-    """Rows of a change of the drives' presliding length, in shares of it, by joint from 0, where the arm has one."""
+    """Rows of a change of the logarithm of the drives' presliding lengths, by joint from 0, where the arm has one."""
     nominal = dictionary.nominal
     lengths = nominal.arm.presliding
     if lengths is None or "motor" not in nominal.rows:
         return {}
     found: dict[int, Rows] = {}
     for joint in np.flatnonzero((lengths > 0.0) & nominal.moving).tolist():
-        near = [
-            Shape(length=float(lengths[joint]) * factor) for factor in (1.0 + _LENGTH_STD, 1.0 - _LENGTH_STD)
-        ]
+        near = [Shape(length=float(lengths[joint]) * factor) for factor in (_APART, 1.0 / _APART)]
 
         def made(motion: ArmMotion, joint: int = joint, near: Sequence[Shape] = tuple(near)) -> list[Column]:
-            scale = float(motion.motor_coulomb[joint]) / (2.0 * _LENGTH_STD)
+            scale = float(motion.motor_coulomb[joint]) / (2.0 * np.log(_APART))
             longer, shorter = (np.asarray(PRESLIDING.columns(motion, joint, one)[0].motor) for one in near)
             return [Column(motor=scale * (longer - shorter))]
 

@@ -49,7 +49,7 @@ def sizes(entries: list[dict[str, Any]]) -> list[tuple[float, float]]:
 
 def test_the_friction_of_a_drive_turns_over_the_length_of_these_days() -> None:
     entries = turning_friction(
-        model(0.5, 4.0), bench(("joint", "motor")), selection(presliding_2=(0.5, 0.1)), ()
+        model(0.5, 4.0), bench(("joint", "motor")), selection(presliding_2=(np.log(1.5), 0.1)), ()
     )
     assert sizes(entries) == [pytest.approx((4.0, 0.015))]
 

@@ -15,6 +15,7 @@ from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import LINK_FRICTION
 from ident.dynamics.structure import Condition, ModelStructure
+from ident.effects import PRESLIDING, parameter_values
 from ident.effects.motion import dahl
 from ident.model import DynamicModel
 from lwr_driver.session import Session
@@ -25,21 +26,23 @@ Signals = dict[str, np.ndarray]
 LENGTH, LATE_S = 4e-3, 3e-3
 
 
-def turning(more: float = 0.0) -> Callable[[Signals], None]:
-    """Friction of the drives that turns over `LENGTH`, `more` of it in joint 2, and torques late by `LATE_S`."""
+def turned(more: float = 0.0, longer: float = 1.0) -> Callable[[Signals], None]:
+    """Friction of the drives that turns over `LENGTH`, `longer` of them in joint 2 and `more` friction there, and
+    torques late by `LATE_S`."""
 
     def change(s: Signals) -> None:
         for j in range(3):
             along = np.ascontiguousarray(np.cumsum(s["qd"][:, j]) * (s["time"][1] - s["time"][0]))
-            state = dahl(along, LENGTH, float(np.sign(s["qd"][0, j])))
+            state = dahl(along, LENGTH * (longer if j == 1 else 1.0), float(np.sign(s["qd"][0, j])))
             s["motor"][:, j] += 1.5 * (state - np.sign(s["qd"][:, j])) + (more * state if j == 1 else 0.0)
             s["motor"][:, j] = np.interp(s["time"] - LATE_S, s["time"], s["motor"][:, j])
 
     return change
 
 
-def alone(make: Make, seed: int, more: float = 0.0) -> list[Session]:
-    made = [make("a.mcap", seed, turning(more)), make("b.mcap", seed + 1, turning(more), 1)]
+def alone(make: Make, seed: int, more: float = 0.0, longer: float = 1.0) -> list[Session]:
+    change = turned(more, longer)
+    made = [make("a.mcap", seed, change), make("b.mcap", seed + 1, change, 1)]
     return [replace(s, joint=replace(s.joint, effort=s.joint.effort[:, :0])) for s in made]
 
 
@@ -64,6 +67,17 @@ def test_more_friction_is_wear_of_its_joint(make: Make, chain: Chain, reference:
     assert share.value == pytest.approx(0.6 / 1.6, abs=3.0 * share.std)
     assert share.std < 0.1
     assert all(one.confidence < found.confidence for one in findings if one is not found)
+
+
+@pytest.mark.parametrize("longer", [0.6, 2.2])
+def test_another_length_of_these_days_is_no_finding(
+    make: Make, chain: Chain, reference: Reference, longer: float
+) -> None:
+    found = diagnose(alone(make, 51, longer=longer), chain, reference=reference)
+    assert not found.findings
+    turning = [e for e in found.base_model.effects if e["cause"] == PRESLIDING.cause]
+    (length,) = (parameter_values(entry)["length"] for entry in turning if entry["joints"] == [2])
+    assert length == pytest.approx(LENGTH * longer, rel=0.1)
 
 
 def test_friction_is_compared_with_that_of_sessions_with_the_same_torques(chain: Chain) -> None:

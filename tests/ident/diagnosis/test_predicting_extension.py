@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from ident.diagnosis import Diagnosis, diagnose, models
-from ident.diagnosis.extension import torque_error
+from ident.diagnosis.extension import squares_left, torque_errors
 from ident.dynamics.kinematics import Chain
 from ident.estimation.validate import validate
 from ident.model import DynamicModel
@@ -32,14 +34,22 @@ def found(logs: tuple[list[Session], Session], chain: Chain) -> Diagnosis:
     return diagnose(logs[0], chain, test=[logs[1]], causes=["cable_spring"])
 
 
-def test_the_torque_error_is_that_of_validate(logs: tuple[list[Session], Session], chain: Chain) -> None:
+def test_the_torque_errors_are_those_of_validate(logs: tuple[list[Session], Session], chain: Chain) -> None:
     told = found(logs, chain)
     assert {f.joints for f in told.claims} == {(2,), (3,)}
-    for model in (told.base_model, told.extended_model):
-        relative = validate(model, [logs[1]]).scores[0].relative
-        square = sum(error**2 for error in relative.values()) / len(relative)
-        assert torque_error(model, [logs[1]]) == pytest.approx(square)
-    assert torque_error(told.extended_model, [logs[1]]) < 0.5 * torque_error(told.base_model, [logs[1]])
+    errors = [torque_errors(model, [logs[1]]) for model in (told.extended_model, told.base_model)]
+    for model, own in zip((told.extended_model, told.base_model), errors, strict=True):
+        assert own.tolist() == list(validate(model, [logs[1]]).scores[0].relative.values())
+    assert squares_left(*errors) < 0.5
+
+
+def test_each_side_is_measured_by_its_own_error() -> None:
+    before = np.array([0.2, 0.005])
+    assert (
+        squares_left(np.array([0.2002, 0.003]), before) < 1.0 < squares_left(np.array([0.2, 0.006]), before)
+    )
+    assert squares_left(before[:1], before) == np.inf
+    assert squares_left(before[:0], before[:0]) == 1.0
 
 
 @pytest.mark.parametrize("harmful", [2, 3])
@@ -48,11 +58,11 @@ def test_an_effect_that_raises_the_torque_error_is_not_in_the_extension(
 ) -> None:
     sure = {f.joints: f.confidence for f in found(logs, chain).claims}
 
-    def measured(model: DynamicModel, sessions: Sequence[Session]) -> float:
+    def measured(model: DynamicModel, sessions: Sequence[Session]) -> NDArray[np.float64]:
         joints = [entry["joints"] for entry in model.effects]
-        return 1.0 + 2.0 * ([harmful] in joints) - 0.5 * (len(joints) > 0)
+        return np.array([1.0 + 2.0 * ([harmful] in joints) - 0.5 * (len(joints) > 0)])
 
-    monkeypatch.setattr(models, "torque_error", measured)
+    monkeypatch.setattr(models, "torque_errors", measured)
     told = found(logs, chain)
     other = 5 - harmful
     assert [entry["joints"] for entry in told.extended_model.effects] == [[other]]

@@ -85,6 +85,9 @@ def test_a_constant_misfit_hides_no_change_of_the_same_candidate() -> None:
     assert state(1.0, 50.0).unusual(trial)
     assert not state(1.0, 150.0).unusual(trial)
     assert not state(2.0, 50.0).unusual(trial)
+    # However alike the days were, a change is more than a claim asks for.
+    assert state(1.4, 1.0).unusual(trial)
+    assert not state(1.5, 1.0).unusual(trial)
     assert not State(dictionary, None, DiagnosisSettings(), Healthy({KEY: 1000.0})).unusual(trial)  # type: ignore[arg-type]
 
 
