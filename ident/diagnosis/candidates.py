@@ -11,6 +11,7 @@ import numpy as np
 
 from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
 from ident.diagnosis.nominal import Nominal
+from ident.diagnosis.recording import sensor_limits
 from ident.effects import DELAYS, EFFECTS, Effect, Setting, Shape
 from lwr_driver.session.spool import Arena
 
@@ -22,8 +23,6 @@ _EDGE_S = 0.6
 _A_COEFFICIENT = 6.0
 # Standard deviation of a coefficient equal to 1 by physics, for the gain on held-back parts.
 _ABOUT_ONE = 0.3
-# Largest relative difference of one sensor's limit between sessions.
-_ONE_LIMIT = 1e-3
 # Least fall of the chi-square for a common search of a shape's parameters.
 _VALLEY = 30.0
 # Least further fall of the chi-square by a recurring push.
@@ -482,7 +481,7 @@ def _setting(nominal: Nominal, *, compared: bool) -> Setting:
         standstill_rad_s=nominal.settings.standstill_rad_s,
         compared=compared,
         compliance=arm.compliance if all(m.springs is not None for m in motions) else None,
-        clipped=_clipped(nominal),
+        clipped=sensor_limits([r for r in nominal.recordings if not r.test], arm.chain.n),
         pauses=_apart(nominal),
     )
 
@@ -492,14 +491,3 @@ def _apart(nominal: Nominal) -> bool:
     ordered = sorted(nominal.recordings, key=lambda r: r.begun_s)
     pauses = [b.begun_s - a.begun_s - a.duration_s for a, b in pairwise(ordered)]
     return bool(pauses) and all(0.0 < pause < _DAY_S for pause in pauses)
-
-
-def _clipped(nominal: Nominal) -> Floats:
-    """Torque (n,) [Nm] at the limit of each joint's sensor, equal in the fitted sessions with a limit, else
-    NaN."""
-    limits = np.array([r.clipped for r in nominal.recordings if not r.test and r.has_effort])
-    if not limits.size:
-        return np.full(nominal.arm.chain.n, np.nan)
-    low = np.min(np.where(np.isfinite(limits), limits, np.inf), axis=0)
-    high = np.max(np.where(np.isfinite(limits), limits, -np.inf), axis=0)
-    return np.where((high > 0.0) & (high - low <= _ONE_LIMIT * high), high, np.nan)

@@ -12,7 +12,7 @@ from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, doubted
 from ident.diagnosis.evidence import Floats
 from ident.diagnosis.extension import Member, extension, power_left, squares_left, title, torque_errors
-from ident.diagnosis.findings import loss_finding
+from ident.diagnosis.findings import limit_findings, loss_finding
 from ident.diagnosis.held_out import held_out
 from ident.diagnosis.models import changes_of, fitted_models, lasting, without_harm
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
@@ -74,6 +74,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
     loss = sample_loss(list(task.sessions))
     if loss:
         findings.append(loss_finding(loss[0]))
+    findings += limit_findings(nominal.recordings, findings)
+    doubts = [d for d in doubts if not any((d.cause, d.joints) == (f.cause, f.joints) for f in findings)]
     findings.sort(key=lambda f: -f.gain)
     made = fitted_models(task, state, baseline, members, after)
     base_model, extended = made.base, made.extended

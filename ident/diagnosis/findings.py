@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
@@ -10,11 +12,12 @@ from ident.diagnosis.evidence import Key
 from ident.diagnosis.held_out import HeldOut, interval
 from ident.diagnosis.intervals import estimated
 from ident.diagnosis.model_form import companions
+from ident.diagnosis.recording import SessionRecord, sensor_limits
 from ident.diagnosis.reference import DELAY_STD_S
 from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.selection import Claim
 from ident.diagnosis.task import State, Task
-from ident.effects import LOST_SAMPLES
+from ident.effects import LOST_SAMPLES, SENSOR_SATURATION
 from ident.rows.data_quality import SampleLoss
 
 
@@ -127,3 +130,32 @@ def loss_finding(worst: SampleLoss) -> Finding:
         mode=f"{worst.lost} lost, {worst.repeated} repeated and {worst.stale} stale of {count} {worst.channel} "
         f"samples in {worst.session}",
     )
+
+
+def limit_findings(records: Sequence[SessionRecord], found: Sequence[Finding]) -> list[Finding]:
+    """Findings of sensors that stop at a limit in the samples of any session, but for those `found`: too few samples
+    for a gain, or none in the sessions fitted."""
+    limits = sensor_limits(records, len(records[0].joint_names))
+    known = {f.joints for f in found if f.cause == SENSOR_SATURATION.cause}
+    told = []
+    for joint in np.flatnonzero(np.isfinite(limits)).tolist():
+        limit = float(limits[joint])
+        shape = SENSOR_SATURATION.seen_at(limit)
+        if (joint + 1,) in known:
+            continue
+        std = SENSOR_SATURATION.law_std({"limit": limit}, shape.form)["limit"]
+        told.append(
+            Finding(
+                SENSOR_SATURATION.cause,
+                SENSOR_SATURATION.side,
+                (joint + 1,),
+                {"limit": Value(limit, std, "Nm")},
+                Evident(0.0, 1e-12, 0.0, 0.0, (0.0, 0.0)),
+                0.99,
+                (),
+                SENSOR_SATURATION.tell_apart.format(joint=joint + 1),
+                0.0,
+                form=str(getattr(shape.form, "value", "")),
+            )
+        )
+    return told

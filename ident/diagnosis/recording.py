@@ -29,6 +29,8 @@ logger = logging.getLogger(__name__)
 
 # Least period of motor samples over that of positions, for a clock of their own.
 _OWN_CLOCK = 1.5
+# Largest relative difference of one sensor's limit between sessions.
+_ONE_LIMIT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,3 +206,13 @@ def _stretches(prepared: PreparedSession, rate: float, stuck: Sequence[Stuck]) -
         q, qd, qdd, effort = (stored([x]) for x in (q, qd, qdd, effort))
         found.append(RecordStretch(time, q, qd, qdd, effort, known, motor_time, motor, usable))
     return found
+
+
+def sensor_limits(records: Sequence[SessionRecord], joints: int) -> Floats:
+    """Torque (n,) [Nm] at the limit of each joint's sensor, equal in the sessions with a limit, else NaN."""
+    limits = np.array([r.clipped for r in records if r.has_effort])
+    if not limits.size:
+        return np.full(joints, np.nan)
+    low = np.min(np.where(np.isfinite(limits), limits, np.inf), axis=0)
+    high = np.max(np.where(np.isfinite(limits), limits, -np.inf), axis=0)
+    return np.where((high > 0.0) & (high - low <= _ONE_LIMIT * high), high, np.nan)

@@ -42,6 +42,7 @@ __all__ = [
     "PAYLOAD_ERROR",
     "PRESLIDING",
     "SENSOR_GAIN",
+    "SENSOR_SATURATION",
     "WEAR",
     "ZERO_OFFSET",
     "ArmMotion",
@@ -72,6 +73,7 @@ ELASTICITY = link.JointElasticity()
 BASE_TILT = link.BaseTilt()
 PAYLOAD_ERROR = load.PayloadError()
 SENSOR_GAIN = channel.SensorGain()
+SENSOR_SATURATION = channel.SensorSaturation()
 ZERO_OFFSET = link.JointZeroOffset()
 LOST_SAMPLES = channel.LostSamples()
 DELAYS = {"motor": channel.MotorTorqueDelay(), "joint": channel.JointTorqueDelay()}
@@ -101,7 +103,7 @@ EFFECTS: dict[str, Effect] = {
         SENSOR_GAIN,
         channel.SensorCrosstalk(),
         channel.SensorHysteresis(),
-        channel.SensorSaturation(),
+        SENSOR_SATURATION,
         channel.SensorOffsetDrift(),
         channel.SensorRipple(),
         *DELAYS.values(),

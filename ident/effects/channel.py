@@ -155,10 +155,14 @@ class SensorSaturation(Effect):
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """The end of the samples, if there is one; else from half to all of the predicted range."""
         if setting.clipped is not None and np.isfinite(setting.clipped[joint]):
-            return [Shape(_Clipping.SEEN, limit=setting.clipped[joint])]
+            return [self.seen_at(float(setting.clipped[joint]))]
         top = float(setting.torque_range[joint])
         shares = (0.5, 0.65, 0.75, 0.85, 0.92, 0.97)
         return [Shape(_Clipping.FITTED, limit=share * top) for share in shares if top > 0.1]
+
+    def seen_at(self, limit: float) -> Shape:
+        """The shape of a limit [Nm] that the samples show."""
+        return Shape(_Clipping.SEEN, limit=limit)
 
     def continuous(self, shape: Shape) -> tuple[str, ...]:
         """The limit, unless the samples show it."""

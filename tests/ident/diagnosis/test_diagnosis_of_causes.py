@@ -4,13 +4,15 @@ import functools
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
 from fri.errors import DataError
 from ident.diagnosis import ArmData, Diagnosis, Reference, commission, diagnose
+from ident.diagnosis.recording import sensor_limits
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
 from ident.model.model_file import model_text, read_model
@@ -402,6 +404,32 @@ def test_a_sensor_that_clips_for_a_moment_is_no_contact(make: Make, chain: Chain
     (found,) = diagnose(clipped, chain).claims
     assert (found.cause, found.joints) == ("sensor_saturation", (2,))
     assert found.parameters["limit"].value == pytest.approx(limit, abs=1e-9)
+
+
+def at_most(session: Session, limit: float) -> Session:
+    effort = np.minimum(session.joint.effort, [np.inf, limit, np.inf])
+    return replace(session, joint=replace(session.joint, effort=effort))
+
+
+def test_a_limit_in_held_out_samples_alone_is_told(make: Make, chain: Chain) -> None:
+    """No session fitted reaches it, so no fit gains by it."""
+    sessions = pair(make)
+    top = max(float(one.joint.effort[:, 1].max()) for one in sessions)
+    further = make("c.mcap", 3)
+    more = replace(further.joint, effort=further.joint.effort * [1.0, 3.0, 1.0])
+    clipped = at_most(replace(further, joint=more), 1.05 * top)
+    found = [f for f in diagnose(sessions, chain, test=[clipped]).findings if f.cause == "sensor_saturation"]
+    assert [(f.joints, f.form, f.confidence) for f in found] == [((2,), "seen in the samples", 0.99)]
+    assert found[0].parameters["limit"].value == 1.05 * top
+
+
+def test_different_ends_of_the_samples_are_no_limit() -> None:
+    def record(*limits: float) -> Any:
+        return SimpleNamespace(has_effort=True, clipped=np.array(limits))
+
+    none = np.nan
+    limits = sensor_limits([record(none, 5.0, 5.0), record(3.0, 5.0, 8.0)], 3)
+    np.testing.assert_array_equal(limits, [3.0, 5.0, none])
 
 
 def test_rest_and_coarse_or_held_samples_are_no_clipping(make: Make) -> None:
