@@ -21,8 +21,8 @@ from ident.diagnosis.nominal import GAIN_STD
 from ident.diagnosis.result import Finding, Nameless
 from ident.diagnosis.selection import Selection
 from ident.diagnosis.task import Baseline, ModelFit, State, Task
-from ident.diagnosis.tolerances import COMPLIANCE, GAIN, LENGTH
-from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of, parameter_values
+from ident.diagnosis.tolerances import COMPLIANCE, GAIN, LENGTH, SIZE
+from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of, parameter_values, sized
 from ident.estimation.turning import drive_coulomb
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
@@ -35,12 +35,13 @@ _CLEAR, _MATTERS = 2.0, 0.5
 
 def lasting(selection: Selection) -> dict[str, Rows]:
     """The tolerated deviations that stay beside the columns of a model: delays and stiffness, which are no torques,
-    and the gains of the torque sensors that are clear of zero, which the models predict as these sensors show them."""
+    and the gains of the torque sensors and the sizes of the healthy effects that are clear of zero, which the
+    models predict as on these days."""
     found = {}
     for name, rows in selection.tolerated.items():
         value, std = selection.nuisance[name]
         clear = abs(value) > max(_CLEAR * std, _MATTERS * GAIN_STD)
-        if "delay" in name or name.startswith(COMPLIANCE) or (name.startswith(GAIN) and clear):
+        if "delay" in name or name.startswith(COMPLIANCE) or (name.startswith((GAIN, SIZE)) and clear):
             found[name] = rows
     return found
 
@@ -104,7 +105,11 @@ def _with_effects(
         if name.startswith(GAIN)
     ]
     turning = turning_friction(model, bench, selection, found)
-    return replace(model, effects=(*bench.nominal.arm.healthy, *gains, *turning, *found))
+    own = [
+        sized(entry, 1.0 + fit.beside.get(f"{SIZE} {number + 1}", (0.0, 0.0))[0])
+        for number, entry in enumerate(bench.nominal.arm.healthy)
+    ]
+    return replace(model, effects=(*own, *gains, *turning, *found))
 
 
 def turning_friction(

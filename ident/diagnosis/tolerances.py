@@ -1,20 +1,31 @@
 """Deviations of the nominal arm that are no finding: columns of the base beside every cause.
 
 Delays of a millisecond, joint stiffness, and, against a reference, what differs from day to day: the gains of the
-torque sensors and the presliding lengths of the drives.
+torque sensors, the presliding lengths of the drives, and the sizes of the healthy arm's own effects.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.evidence import Evidence, Rows
+from ident.diagnosis.reference import USUAL_CHANGES
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.effects import DELAYS, ELASTICITY, PRESLIDING, SENSOR_GAIN, Column, Shape
+from ident.effects import (
+    DELAYS,
+    ELASTICITY,
+    PRESLIDING,
+    SENSOR_GAIN,
+    Column,
+    Effect,
+    Shape,
+    find_effect,
+    parameter_values,
+)
 from ident.effects.motion import ArmMotion
 
 # Factor on the tolerance for a whole channel's delay with a known healthy delay.
@@ -32,6 +43,8 @@ COMPLIANCE = "compliance"
 """The same for a joint's compliance."""
 LENGTH = "presliding"
 """The same for the presliding length of a drive, the logarithm of the factor on it."""
+SIZE = "size"
+"""The same for one of the healthy arm's own effects, a share of it, before its number among them."""
 
 
 class Tolerance(NamedTuple):
@@ -77,6 +90,7 @@ def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSe
             Tolerance(f"{LENGTH} {j + 1}", rows, 1.0, np.log(_LONGEST), (PRESLIDING.cause, j))
             for j, rows in _presliding_rows(dictionary).items()
         ]
+        found += _sizes(dictionary, evidence, settings.least_gain)
     return found
 
 
@@ -100,6 +114,33 @@ def _joint_delays(dictionary: Dictionary, evidence: Evidence, rows: Rows, limit:
             apart = {key: rows[key], best: -weight[key] / weight[best] * rows[best]}
             found.append(Tolerance(f"delay of joint {key[1] + 1} apart", apart, 1e-3, 2.0 * limit))
     return found
+
+
+def _sizes(dictionary: Dictionary, evidence: Evidence, least_gain: float) -> list[Tolerance]:
+    """Other sizes of the healthy arm's own effects, where a usual change of one would show."""
+    found = []
+    for number, entry in enumerate(dictionary.nominal.arm.healthy):
+        effect, values = find_effect(str(entry["cause"])), parameter_values(entry)
+        candidate = Candidate(effect, int(entry["joints"][0]) - 1 if entry["joints"] else -1)
+        coefficients = effect.coefficients_of(values)
+        columns = dictionary.rows(candidate, effect.shape_of(values, entry.get("form")))
+        # Plain forms have fewer columns than the effect has coefficients.
+        rows = {key: own @ coefficients[: own.shape[1], None] for key, own in columns.items()}
+        if not rows:
+            continue
+        size = HABITUAL * _usual_share(entry, effect)
+        if evidence.information(evidence.alone(evidence.padded(rows))) * size**2 > least_gain:
+            found.append(Tolerance(f"{SIZE} {number + 1}", rows, 1.0, size, candidate.key))
+    return found
+
+
+def _usual_share(entry: Mapping[str, Any], effect: Effect) -> float:
+    """Standard deviation of the size of a healthy arm's effect from day to day, as a share of it: from its scatter over
+    the healthy sets, with the usual one as some further changes."""
+    linear = [entry["parameters"][p.name] for p in effect.linear if p.name in entry["parameters"]]
+    size, scatter = (float(np.linalg.norm([one[name] for one in linear])) for name in ("value", "std"))
+    own = scatter / max(size, 1e-300)
+    return float(np.sqrt((USUAL_CHANGES * effect.usual_share**2 + own**2) / (USUAL_CHANGES + 1.0)))
 
 
 def gain_rows(dictionary: Dictionary) -> dict[int, Rows]:

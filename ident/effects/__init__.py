@@ -62,6 +62,7 @@ __all__ = [
     "entry_of",
     "find_effect",
     "parameter_values",
+    "sized",
     "summary_of",
 ]
 
@@ -203,6 +204,18 @@ def parameter_values(entry: Mapping[str, Any]) -> dict[str, float]:
         name: float(value["value"] if isinstance(value, Mapping) else value)
         for name, value in entry["parameters"].items()
     }
+
+
+def sized(entry: Mapping[str, Any], factor: float) -> Mapping[str, Any]:
+    """An entry of a model's effects with `factor` times its torque."""
+    linear = {p.name for p in find_effect(str(entry["cause"])).linear}
+    values = {
+        name: {**one, "value": factor * one["value"], "std": abs(factor) * one["std"]}
+        if name in linear
+        else one
+        for name, one in entry["parameters"].items()
+    }
+    return entry if factor == 1.0 else {**entry, "parameters": values}
 
 
 def effects_torque(

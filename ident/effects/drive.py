@@ -26,6 +26,9 @@ from ident.effects.effect import (
 from ident.effects.motion import ArmMotion, Floats, turned_friction
 from ident.effects.words import Values, quantity, quantity_text, times, wave
 
+# Usual standard deviation of friction from day to day as a share of it, for its film depends on everything.
+_FRICTION = 0.15
+
 
 def dahl_step(run: Simulated, here: float, length: float) -> float:
     """Dahl's state of a simulated effect at the coordinate `here`, one cycle later."""
@@ -114,6 +117,7 @@ class Stribeck(Effect):
 
     cause = "stribeck"
     side = "motor"
+    usual_share = _FRICTION
     character = True
     summary = "friction rises as the velocity falls towards zero"
     physics = "the lubricant film breaks down at low speed, so friction rises as the speed falls towards zero"
@@ -162,6 +166,7 @@ class ViscousNonlinear(Effect):
 
     cause = "viscous_nonlinear"
     side = "motor"
+    usual_share = _FRICTION
     character = True
     summary = "viscous friction is not proportional to velocity"
     physics = "the lubricant thins under shear, so viscous friction grows slower (or faster) than the speed"
@@ -222,6 +227,7 @@ class FrictionAsymmetry(Effect):
 
     cause = "friction_asymmetry"
     side = "motor"
+    usual_share = _FRICTION
     character = True
     summary = "friction depends on the direction"
     physics = "gear teeth and bearings engage differently in the two directions"
@@ -268,6 +274,7 @@ class FrictionLoad(Effect):
 
     cause = "friction_load"
     side = "motor"
+    usual_share = _FRICTION
     character = True
     summary = "friction grows with the transmitted torque"
     physics = (
@@ -306,6 +313,7 @@ class FrictionTemperature(Drifting):
 
     cause = "friction_temperature"
     side = "motor"
+    usual_share = _FRICTION
     character = True
     summary = "friction drifts as the joint warms up"
     physics = "the lubricant thins as it warms up, so friction drifts with the time in use"
@@ -363,6 +371,7 @@ class FrictionPosition(Effect):
 
     cause = "friction_position"
     side = "motor"
+    usual_share = _FRICTION
     summary = "friction depends on the joint angle"
     physics = "a gear or bearing with run-out or a worn spot grips more at some angles of the joint"
     source = "Armstrong-Helouvry, Control of Machines with Friction (1991), chapter 4"

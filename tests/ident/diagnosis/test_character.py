@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ident.diagnosis import commission
+from ident.diagnosis import commission, diagnose
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.character import Size, _carried, _kind
 from ident.diagnosis.evidence import Score
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.kinematics import Chain
-from ident.effects import EFFECTS, Shape
+from ident.effects import EFFECTS, Shape, parameter_values
 from lwr_driver.session import Session
 
 Make = Callable[..., Session]
@@ -62,25 +62,35 @@ def test_each_harmonic_of_a_ripple_may_be_in_the_model() -> None:
     )
 
 
+def sticky(make: Make, day: int, amplitude: float) -> list[Session]:
+    """Sessions of a day with friction of joint 2 that rises by `amplitude` towards a standstill."""
+
+    def stick(s: Signals) -> None:
+        v = s["qd"][:, 1]
+        s["motor"][:, 1] += amplitude * np.sign(v) * np.exp(-np.abs(v) / 0.1)
+
+    return [make("a.mcap", 11 + 10 * day, stick), make("b.mcap", 12 + 10 * day, stick, 1)]
+
+
 def test_friction_that_all_healthy_days_show_is_in_the_reference_and_what_comes_and_goes_is_not(
     make: Make, chain: Chain
 ) -> None:
-    def days(amplitudes: tuple[float, ...]) -> list[list[Session]]:
-        def change(amplitude: float) -> Callable[[Signals], None]:
-            def stick(s: Signals) -> None:
-                v = s["qd"][:, 1]
-                s["motor"][:, 1] += amplitude * np.sign(v) * np.exp(-np.abs(v) / 0.1)
-
-            return stick
-
-        return [
-            [
-                make("a.mcap", 11 + 10 * k, change(amplitude)),
-                make("b.mcap", 12 + 10 * k, change(amplitude), 1),
-            ]
-            for k, amplitude in enumerate(amplitudes)
-        ]
-
-    lasting = commission(days((0.12, 0.12)), chain).model.effects
+    lasting = commission([sticky(make, 0, 0.12), sticky(make, 1, 0.12)], chain).model.effects
     assert [(entry["cause"], entry["joints"]) for entry in lasting] == [("stribeck", [2])]
-    assert not commission(days((0.12, -0.12)), chain).model.effects
+    assert not commission([sticky(make, 0, 0.12), sticky(make, 1, -0.12)], chain).model.effects
+
+
+def test_a_usual_change_of_what_the_healthy_arm_has_is_in_the_models_and_no_finding(
+    make: Make, chain: Chain
+) -> None:
+    reference = commission([sticky(make, 0, 0.4), sticky(make, 1, 0.4)], chain)
+    (own,) = (parameter_values(entry) for entry in reference.model.effects)
+    for times in (0.75, 1.3):
+        found = diagnose(sticky(make, 2, 0.4 * times), chain, reference=reference)
+        assert not found.findings
+        (entry,) = (entry for entry in found.base_model.effects if entry["cause"] == "stribeck")
+        now = parameter_values(entry)
+        assert now["amplitude"] == pytest.approx(times * own["amplitude"], rel=0.1)
+        assert now["velocity"] == own["velocity"]
+    findings = diagnose(sticky(make, 2, 1.2), chain, reference=reference).findings
+    assert [(f.cause, f.joints) for f in findings] == [("stribeck", (2,))]
