@@ -481,7 +481,8 @@ def advice(
                 f"rows at {settings.row_rate_hz:g} Hz exceed the {name} channel's {rate:.1f} Hz; lower "
                 "`decimate_hz`"
             )
-    if settings.cutoff > 0.2 * joint_rate_hz:
+    # A rate taken from stamps is a little off, and the default cut-off is that share of it.
+    if settings.cutoff > 1.01 * NYQUIST_SHARE * joint_rate_hz:
         found.append(
             f"the position cut-off {settings.cutoff:g} Hz is above a fifth of the sampling rate "
             f"{joint_rate_hz:.0f} Hz; differences lose accuracy there, lower `cutoff_hz`"
