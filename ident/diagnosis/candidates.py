@@ -8,17 +8,21 @@ from functools import partial
 from itertools import pairwise, product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
-from ident.diagnosis.nominal import Nominal
+from ident.diagnosis.nominal import Nominal, SideRows
 from ident.diagnosis.recording import sensor_limits
 from ident.effects import DELAYS, EFFECTS, Effect, Setting, Shape
+from ident.rows.data_quality import run_bounds
 from lwr_driver.session.spool import Arena
 
 # Bursts: shortest, least excess over its standard deviation, longest, largest number.
 _WINDOW_S, _FAR, _LONGEST_S, _MOST = 0.1, 8.0, 4.0, 4
 # Distance from the ends of a session within which filters and wide bins are unreliable.
 _EDGE_S = 0.6
+# The same from a standstill of the whole arm, and its least length: joints stick and links ring there.
+_BESIDE_REST_S, _REST_S = 0.3, 0.2
 # Least gain of a further coefficient of the same cause.
 _A_COEFFICIENT = 6.0
 # Standard deviation of a coefficient equal to 1 by physics, for the gain on held-back parts.
@@ -56,7 +60,7 @@ def find_bursts(evidence: Evidence) -> tuple[Burst, ...]:
         if not mine.any():
             continue
         first, last = rows.time[mine].min() + _EDGE_S, rows.time[mine].max() - _EDGE_S
-        mine &= (rows.time >= first) & (rows.time <= last)
+        mine &= (rows.time >= first) & (rows.time <= last) & ~_beside_rest(rows, mine)
         if mine.sum() < 3:
             continue
         time, values = rows.time[mine], normal[mine]
@@ -67,6 +71,19 @@ def find_bursts(evidence: Evidence) -> tuple[Burst, ...]:
             start = float(time[0] + low * _WINDOW_S)
             found.append(Burst(int(session), start, length * _WINDOW_S, excess))
     return tuple(sorted(found, key=lambda b: -b.excess)[:_MOST])
+
+
+def _beside_rest(rows: SideRows, mine: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Rows (m,) among `mine`, of one session, close to a standstill of the whole arm."""
+    time, moving = rows.time[mine], np.any(rows.valid[mine], axis=1)
+    close = np.zeros(len(time), dtype=bool)
+    for first, end in pairwise(run_bounds(moving.astype(np.float64)).tolist()):
+        start, stop = time[first], time[min(end, len(time) - 1)]
+        if not moving[first] and stop - start >= _REST_S:
+            close |= (time > start - _BESIDE_REST_S) & (time < stop + _BESIDE_REST_S)
+    found = np.zeros(len(mine), dtype=bool)
+    found[mine] = close
+    return found
 
 
 def _scan(counts: Floats, sums: Floats) -> Iterator[tuple[int, int, float]]:

@@ -34,6 +34,8 @@ _KNOWN_DELAY = 0.4
 _KNOWN_COMPLIANCE = 0.4
 # Largest factor on a presliding length from day to day, and that of the two lengths of its column.
 _LONGEST, _APART = 5.0, 1.5
+# Standard deviation of a further day from the mean of two, over that of a day.
+_FURTHER = 1.5**0.5
 
 HABITUAL = 3.0
 """Largest change from day to day, in standard deviations."""
@@ -128,7 +130,7 @@ def _sizes(dictionary: Dictionary, evidence: Evidence, least_gain: float) -> lis
         rows = {key: own @ coefficients[: own.shape[1], None] for key, own in columns.items()}
         if not rows:
             continue
-        size = HABITUAL * _usual_share(entry, effect)
+        size = HABITUAL * _FURTHER * _usual_share(entry, effect)
         if evidence.information(evidence.alone(evidence.padded(rows))) * size**2 > least_gain:
             found.append(Tolerance(f"{SIZE} {number + 1}", rows, 1.0, size, candidate.key))
     return found

@@ -26,8 +26,8 @@ from ident.effects.effect import (
 from ident.effects.motion import ArmMotion, Floats, turned_friction
 from ident.effects.words import Values, quantity, quantity_text, times, wave
 
-# Usual standard deviation of friction from day to day as a share of it, for its film depends on everything.
-_FRICTION = 0.15
+# Usual standard deviation of an effect of friction from day to day as a share of it: films depend on everything.
+_FRICTION = 0.2
 
 
 def dahl_step(run: Simulated, here: float, length: float) -> float:

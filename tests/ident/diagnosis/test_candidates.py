@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
-from ident.diagnosis.candidates import Candidate, Dictionary, find_bursts
+from ident.diagnosis.candidates import Candidate, Dictionary, _beside_rest, find_bursts
 from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.signatures import signature_bench
@@ -129,3 +129,18 @@ def test_a_limit_in_the_samples_is_believed_above_the_excess_that_a_clipped_mode
     assert not effect.plausible(bent, guessed)
     assert not effect.plausible(tiny, seen)
     assert not effect.plausible(tiny, guessed)
+
+
+def test_bursts_keep_away_from_a_rest_of_the_whole_arm() -> None:
+    time = np.arange(500) * 0.01
+    moving = np.ones((500, 2), dtype=bool)
+    moving[200:250] = False
+    moving[400:410] = False
+    moving[100:180, 0] = False
+    rows = SimpleNamespace(time=time, valid=moving)
+    mine = np.ones(500, dtype=bool)
+    mine[:150] = False
+    close = _beside_rest(rows, mine)  # type: ignore[arg-type]
+    assert time[close].min() == pytest.approx(1.71)
+    assert time[close].max() == pytest.approx(2.79)
+    assert close.sum() == 109
