@@ -11,7 +11,7 @@ from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, doubted
 from ident.diagnosis.evidence import Floats
-from ident.diagnosis.extension import Member, extension, power_left, squares_left, title, torque_errors
+from ident.diagnosis.extension import Member, TorqueErrors, extension, power_left, title
 from ident.diagnosis.findings import limit_findings, loss_finding
 from ident.diagnosis.held_out import held_out
 from ident.diagnosis.models import changes_of, fitted_models, lasting, without_harm
@@ -92,8 +92,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
         else:
             if nominal.held_out:
                 before, after = (left_by(m, nominal, h) for m, h in ((base_model, before), (extended, after)))
-                errors, of_base = (torque_errors(m, task.test) for m in (extended, base_model))
-                if power_left(before, after) >= 1.0 or squares_left(errors, of_base) > 1.0:
+                errors, of_base = (TorqueErrors.of(m, task.test) for m in (extended, base_model))
+                if power_left(before, after) >= 1.0 or errors.left_of(of_base) > 1.0:
                     extended, after = base_model, before
                 extended_rms = after.rms()
             own = {title(entry) for entry in base_model.effects}

@@ -111,8 +111,7 @@ def diagnose(
         )
         if worthless(broken):
             return _ended(task, broken)
-        task, bench = _of_these_days(task)
-        first = _first(task, bench)
+        task, first = _begun(task)
         others = other_masses(first.bench, reference)
         if others and reference is not None:
             # With a mass of its own it pulls at nothing else.
@@ -137,6 +136,24 @@ def _ended(task: Task, broken: Sequence[BrokenChannel]) -> Diagnosis:
 
 def _bench(task: Task) -> DiagnosisBench:
     return task.bench(task.arm, task.reference, fit_compliance=task.reference is None)
+
+
+def _begun(task: Task) -> tuple[Task, State]:
+    """The task with the presliding lengths of these days, and its first selection; a claim of presliding pulls at the
+    length of its drive, which is the usual one then."""
+    usual = task.arm.presliding
+    task, bench = _of_these_days(task)
+    first = _first(task, bench)
+    if usual is None or task.arm.presliding is None:
+        return task, first
+    claims = [claim.trial.candidate for claim in first.selection.claims]
+    claimed = [candidate.joint for candidate in claims if candidate.effect is PRESLIDING]
+    lengths = task.arm.presliding.copy()
+    lengths[claimed] = usual[claimed]
+    if np.array_equal(lengths, task.arm.presliding):
+        return task, first
+    task = replace(task, arm=replace(task.arm, presliding=lengths))
+    return task, _first(task, _bench(task))
 
 
 def _of_these_days(task: Task) -> tuple[Task, DiagnosisBench]:

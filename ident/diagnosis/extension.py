@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.evidence import Floats, Rows
-from ident.diagnosis.held_out import HeldOut, held_out, interval, worse_rows
+from ident.diagnosis.held_out import FELT_WORSE, HeldOut, held_out, interval, worse_rows
 from ident.diagnosis.probes import Remainder
 from ident.diagnosis.result import Finding, Nameless
 from ident.diagnosis.task import Baseline
@@ -76,22 +76,32 @@ def power_left(before: HeldOut, after: HeldOut) -> float:
     return float(np.nanmean(share))
 
 
-def torque_errors(model: DynamicModel, sessions: Sequence[Session]) -> Floats:
-    """Relative torque errors of a model by session and side, as `validate` measures them with all samples."""
-    scores = validate(model, sessions, allow_seen=True, keep_going=True, known=Known()).scores
-    return np.array([error for score in scores for error in score.relative.values()])
+class TorqueErrors(NamedTuple):
+    """Errors with all samples, as `validate` measures them: relative ones by session and side, and the rms [Nm] by
+    session, side and joint."""
 
+    sides: Floats
+    joints: Floats
 
-def squares_left(errors: Floats, base: Floats) -> float:
-    """Mean square of torque errors over those of the base model: each session and side by its own measure, for the
-    chance of a side with large errors is more than the whole error of another. One where the base model has none,
-    infinite where the other lacks one of them.
-    """
-    if not len(base):
-        return 1.0
-    if errors.shape != base.shape:
-        return np.inf
-    return float(np.mean((errors / np.maximum(base, 1e-12)) ** 2))
+    @classmethod
+    def of(cls, model: DynamicModel, sessions: Sequence[Session]) -> TorqueErrors:
+        """Of a model in sessions."""
+        scores = validate(model, sessions, allow_seen=True, keep_going=True, known=Known()).scores
+        return cls(
+            np.array([error for score in scores for error in score.relative.values()]),
+            np.array([one.rms for score in scores for one in score.scores]),
+        )
+
+    def left_of(self, base: TorqueErrors) -> float:
+        """Mean square of the joints' errors over those of the base model, each by its own measure: chance in a large
+        one is more than the whole of a small one. Infinite where a side's error is felt to be larger or one is missing,
+        one where the base model has none.
+        """
+        if not len(base.joints):
+            return 1.0
+        if self.joints.shape != base.joints.shape or np.any(self.sides > (1.0 + FELT_WORSE) * base.sides):
+            return np.inf
+        return float(np.mean((self.joints / np.maximum(base.joints, 1e-12)) ** 2))
 
 
 def nameless_terms(

@@ -15,7 +15,7 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.evidence import Rows
-from ident.diagnosis.extension import Member, held_out_with, nameless_terms, squares_left, torque_errors
+from ident.diagnosis.extension import Member, TorqueErrors, held_out_with, nameless_terms
 from ident.diagnosis.held_out import HeldOut
 from ident.diagnosis.nominal import GAIN_STD
 from ident.diagnosis.result import Finding, Nameless
@@ -155,15 +155,15 @@ def without_harm(
     bench, nuisance = state.bench, state.selection.nuisance_rows
     refuted: list[Finding] = []
     made = fitted_models(task, state, baseline, members, after)
-    base, extended = (torque_errors(model, task.test) for model in (made.base, made.extended))
-    left = squares_left(extended, base)
+    base, extended = (TorqueErrors.of(model, task.test) for model in (made.base, made.extended))
+    left = extended.left_of(base)
     while members and left > 1.0:
         found = []
         for member in members:
             rest = [m for m in members if m is not member]
             held = held_out_with(bench, rest, nuisance)
             model = fitted_models(task, state, baseline, rest, held).extended
-            found.append((squares_left(torque_errors(model, task.test), base), member))
+            found.append((TorqueErrors.of(model, task.test).left_of(base), member))
         left, worst = min(found, key=lambda pair: pair[0])
         members = [m for m in members if m is not worst]
         refuted += [worst.finding] if worst.finding is not None else []

@@ -6,10 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from ident.diagnosis import Diagnosis, diagnose, models
-from ident.diagnosis.extension import squares_left, torque_errors
+from ident.diagnosis import Diagnosis, diagnose
+from ident.diagnosis.extension import TorqueErrors
 from ident.dynamics.kinematics import Chain
 from ident.estimation.validate import validate
 from ident.model import DynamicModel
@@ -37,19 +36,24 @@ def found(logs: tuple[list[Session], Session], chain: Chain) -> Diagnosis:
 def test_the_torque_errors_are_those_of_validate(logs: tuple[list[Session], Session], chain: Chain) -> None:
     told = found(logs, chain)
     assert {f.joints for f in told.claims} == {(2,), (3,)}
-    errors = [torque_errors(model, [logs[1]]) for model in (told.extended_model, told.base_model)]
-    for model, own in zip((told.extended_model, told.base_model), errors, strict=True):
-        assert own.tolist() == list(validate(model, [logs[1]]).scores[0].relative.values())
-    assert squares_left(*errors) < 0.5
+    extended, base = (TorqueErrors.of(model, [logs[1]]) for model in (told.extended_model, told.base_model))
+    for model, own in ((told.extended_model, extended), (told.base_model, base)):
+        (score,) = validate(model, [logs[1]]).scores
+        assert own.sides.tolist() == list(score.relative.values())
+        assert own.joints.tolist() == [one.rms for one in score.scores]
+    assert extended.left_of(base) < 0.5
 
 
-def test_each_side_is_measured_by_its_own_error() -> None:
-    before = np.array([0.2, 0.005])
-    assert (
-        squares_left(np.array([0.2002, 0.003]), before) < 1.0 < squares_left(np.array([0.2, 0.006]), before)
-    )
-    assert squares_left(before[:1], before) == np.inf
-    assert squares_left(before[:0], before[:0]) == 1.0
+def test_each_joint_is_measured_by_its_own_error() -> None:
+    def errors(sides: list[float], *joints: float) -> TorqueErrors:
+        return TorqueErrors(np.array(sides), np.array(joints))
+
+    before = errors([0.2], 2.0, 0.05)
+    assert errors([0.2002], 2.002, 0.03).left_of(before) < 1.0
+    assert errors([0.2], 2.0, 0.06).left_of(before) > 1.0
+    assert errors([0.203], 2.03, 0.03).left_of(before) == np.inf
+    assert errors([0.2], 2.0).left_of(before) == np.inf
+    assert errors([]).left_of(errors([])) == 1.0
 
 
 @pytest.mark.parametrize("harmful", [2, 3])
@@ -58,11 +62,12 @@ def test_an_effect_that_raises_the_torque_error_is_not_in_the_extension(
 ) -> None:
     sure = {f.joints: f.confidence for f in found(logs, chain).claims}
 
-    def measured(model: DynamicModel, sessions: Sequence[Session]) -> NDArray[np.float64]:
+    def measured(model: DynamicModel, sessions: Sequence[Session]) -> TorqueErrors:
         joints = [entry["joints"] for entry in model.effects]
-        return np.array([1.0 + 2.0 * ([harmful] in joints) - 0.5 * (len(joints) > 0)])
+        error = np.array([1.0 + 2.0 * ([harmful] in joints) - 0.5 * (len(joints) > 0)])
+        return TorqueErrors(error, error)
 
-    monkeypatch.setattr(models, "torque_errors", measured)
+    monkeypatch.setattr(TorqueErrors, "of", measured)
     told = found(logs, chain)
     other = 5 - harmful
     assert [entry["joints"] for entry in told.extended_model.effects] == [[other]]
