@@ -97,6 +97,9 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         text = f"of {len(lengths)} drives turns over {min(lengths):.2g} to {max(lengths):.2g} mrad, in the model: "
         text += f"motor torque error of the fit {error['without']:.3g} -> {error['with']:.3g} %"
         found.append(("friction", text))
+    late = [text for text in (_delay_of(summary, "motor"), _delay_of(summary, "joint")) if text]
+    if late:
+        found.append(("delay", "; ".join(late)))
     masses = [one for one in summary.get("parameters", ()) if _is_mass(one["name"])]
     if masses:
         text = ", ".join(_spread(one["estimate"], one["std"]) for one in masses)
@@ -104,6 +107,23 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     elif "condition" in summary:
         found.append(("condition number", f"{summary['condition']:.4g}"))
     return found
+
+
+def _delay_of(summary: Mapping[str, Any], side: str) -> str:
+    """Delay of a side's torques against the motion in words, empty where it is none."""
+    sessions = summary["sessions"] if isinstance(summary.get("signals"), Mapping) else summary.get("signals")
+    known = [
+        (1e3 * one[f"{side}_delay_s"], 1e3 * (one.get(f"{side}_delay_std_s") or 0.0))
+        for one in sessions or ()
+        if one.get(f"{side}_delay_s")
+    ]
+    if not known:
+        return ""
+    delays, deviations = zip(*known, strict=True)
+    sign, where = (-1.0, "before") if max(delays) < 0.0 else (1.0, "after")
+    least, most = sorted((sign * min(delays), sign * max(delays)))
+    size = f"{most:.1f}" if most - least < 0.05 else f"{least:.1f} to {most:.1f}"
+    return f"{side} torques {size} ms {where} the positions, ± {max(deviations):.2g} ms"
 
 
 def of_estimate(content: Mapping[str, Any], model: Path | None, tables: Sequence[Piece]) -> Ending:

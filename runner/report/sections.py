@@ -72,11 +72,32 @@ def session_section(results: ResultFolder) -> str:
         parts.append(paragraph(text, "soft"))
     if results.unread:
         parts.append(paragraph(f"No log could be read of: {', '.join(results.unread)}.", "soft"))
+    if results.summary.get("signals"):
+        parts.append(_signal_table(results))
     for name, items in results.preflights.items():
         label = f"Conditions before the motion of {name}"
         held = f"{sum(i['ok'] for i in items)} of {len(items)} held"
         parts.append(fold(f"{label}: {held}", conditions_table(items, label)))
     return section("sessions", "Sessions, link and limits", *parts)
+
+
+def _signal_table(results: ResultFolder) -> str:
+    """What the estimate made of each session: rows, lost samples, delays, cut-off."""
+    rows: list[list[Cell]] = []
+    for number, entry in enumerate(results.summary["signals"]):
+        counts = (Number(entry[key], "d", f"signals.{number}.{key}") for key in ("rows", "lost_samples"))
+        delays = (
+            entry.get(key)
+            for key in ("motor_delay_s", "motor_delay_std_s", "joint_delay_s", "joint_delay_std_s")
+        )
+        cutoff = Number(entry["cutoff_hz"], ".3g", f"signals.{number}.cutoff_hz")
+        milliseconds = (Number(None if value is None else 1e3 * value, ".2f") for value in delays)
+        rows.append([entry["name"], *counts, *milliseconds, cutoff])
+    head = (
+        "session", "rows", "lost samples", "motor torque late by [ms]", "± [ms]", "joint torque late by [ms]", "± [ms]",
+        "cut-off [Hz]",
+    )  # fmt: skip
+    return table(head, rows, "Signals of the estimate")
 
 
 def table_1_section(results: ResultFolder) -> str:

@@ -1,0 +1,36 @@
+"""The last lines of a command: the numbers of a summary."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from runner.ending import numbers_of
+
+
+def session(motor: float | None, joint: float | None = None) -> dict[str, Any]:
+    return {
+        "motor_delay_s": motor,
+        "motor_delay_std_s": 2e-4,
+        "joint_delay_s": joint,
+        "joint_delay_std_s": 1e-4,
+    }
+
+
+@pytest.mark.parametrize(
+    ("sessions", "told"),
+    [
+        ([session(0.0), session(None)], None),
+        ([session(2e-3), session(0.0, 0.0)], "motor torques 2.0 ms after the positions, ± 0.2 ms"),
+        (
+            [session(2e-3, -1e-3), session(3e-3)],
+            "motor torques 2.0 to 3.0 ms after the positions, ± 0.2 ms; "
+            "joint torques 1.0 ms before the positions, ± 0.1 ms",
+        ),
+    ],
+)
+def test_delays_in_use_are_told(sessions: list[dict[str, Any]], told: str | None) -> None:
+    # As `Identification.to_dict` has them, and as summary.json.
+    for summary in ({"sessions": sessions, "signals": {"cutoff_hz": 5.0}}, {"signals": sessions}):
+        assert dict(numbers_of(summary)).get("delay") == told
