@@ -19,7 +19,7 @@ from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.tolerances import gain_rows
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling, Side
-from ident.effects import DELAYS, ELASTICITY, Shape
+from ident.effects import DELAYS, ELASTICITY, PRESLIDING, Shape
 from ident.estimators.physical import cad_prior
 
 _BySide = dict[str, Floats]
@@ -71,7 +71,7 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             far_share=reference.far_share,
             gain_std=reference.gain_std,
             couplings=data.couplings,
-            healthy=reference.model.effects,
+            healthy=tuple(e for e in reference.model.effects if e["cause"] != PRESLIDING.cause),
         )
     return NominalArm(chain, compliance, ratio, couplings=data.couplings)
 

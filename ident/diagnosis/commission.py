@@ -36,6 +36,7 @@ from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
 from ident.effects.motion import dahl
 from ident.estimation.identify import IdentificationSettings, Known, observed
+from ident.estimation.turning import drive_coulomb
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.content import Recall
@@ -468,8 +469,11 @@ def _reference(
         _sound(covariance),
         base,
         {"sessions": [s.path.name for s in sessions]},
-        arm.healthy,
     )
+    turning = (
+        arm.turning(drive_coulomb(model, sensed="joint" in usual.sigma)) if "motor" in usual.sigma else []
+    )
+    model = replace(model, effects=(*arm.healthy, *turning))
     noise = {side: np.mean([day.sigma[side] for day in days], axis=0) for side in usual.sigma}
     return Reference(
         model,

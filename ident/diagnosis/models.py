@@ -118,28 +118,16 @@ def turning_friction(
     """Entries of the drives' friction that turns over the arm's presliding lengths of these days, but for what `found`
     says of it."""
     nominal = bench.nominal
-    arm = nominal.arm
-    if arm.presliding is None or "motor" not in nominal.rows:
+    if "motor" not in nominal.rows:
         return []
     level = drive_coulomb(model, sensed="joint" in nominal.rows)
-    entries = []
-    for joint in np.flatnonzero(arm.presliding > 0.0).tolist():
-        taken = sum(
-            parameter_values(e)["amplitude"]
-            for e in found
-            if e["cause"] == PRESLIDING.cause and joint + 1 in e["joints"]
-        )
-        left = max(float(level[joint]) - taken, 0.0)
-        longer, _ = selection.nuisance.get(f"{LENGTH} {joint + 1}", (0.0, 0.0))
-        far = 0.0 if arm.far_share is None else float(arm.far_share[joint])
-        parts = [(left * (1.0 - far), float(arm.presliding[joint]) * float(np.exp(longer)))]
-        if far and arm.far is not None:
-            parts.append((left * far, float(arm.far[joint])))
-        entries += [
-            entry_of(PRESLIDING, [joint + 1], {"amplitude": (amplitude, 0.0), "length": (length, 0.0)})
-            for amplitude, length in parts
-        ]
-    return entries
+    taken = np.zeros(len(level))
+    for entry in found:
+        if entry["cause"] == PRESLIDING.cause:
+            taken[entry["joints"][0] - 1] += parameter_values(entry)["amplitude"]
+    names = (f"{LENGTH} {joint + 1}" for joint in range(len(level)))
+    longer = np.exp([selection.nuisance.get(name, (0.0, 0.0))[0] for name in names])
+    return nominal.arm.turning(np.maximum(level - taken, 0.0), longer)
 
 
 def without_harm(

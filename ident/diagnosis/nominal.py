@@ -29,7 +29,7 @@ from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, Coupling, DriveMotion, ModelStructure, Side
-from ident.effects import SENSOR_GAIN, Column, effects_torque
+from ident.effects import PRESLIDING, SENSOR_GAIN, Column, effects_torque, entry_of
 from ident.effects.motion import ArmMotion, dahl, in_order
 from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
@@ -95,6 +95,24 @@ class NominalArm:
     def delays(self) -> dict[str, float]:
         """Delays of the channels [s], as in the signal settings of a model."""
         return {"motor_delay_s": self.motor_delay_s, "joint_delay_s": self.joint_delay_s}
+
+    def turning(self, level: Floats, longer: Floats | float = 1.0) -> list[dict[str, Any]]:
+        """Entries of a model for Coulomb friction (n,) [Nm] that turns over the arm's lengths, `longer` times the near
+        ones (n,)."""
+        if self.presliding is None:
+            return []
+        near = self.presliding * longer
+        entries = []
+        for joint in np.flatnonzero(self.presliding > 0.0).tolist():
+            far = 0.0 if self.far_share is None else float(self.far_share[joint])
+            parts = [(level[joint] * (1.0 - far), near[joint])]
+            if far and self.far is not None:
+                parts.append((level[joint] * far, self.far[joint]))
+            entries += [
+                entry_of(PRESLIDING, [joint + 1], {"amplitude": (amplitude, 0.0), "length": (length, 0.0)})
+                for amplitude, length in parts
+            ]
+        return entries
 
     def slip(self, speed: Floats, dt: float) -> Floats:
         """Coulomb friction of the drives over its level for motor speeds (N, n) [rad/s]: Dahl's state, or the sum of

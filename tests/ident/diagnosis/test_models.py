@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ident.diagnosis.models import lasting, turning_friction
+from ident.diagnosis.nominal import NominalArm
 from ident.diagnosis.selection import Selection
 from ident.effects import PRESLIDING, entry_of
 
@@ -32,8 +33,13 @@ def test_a_model_stays_beside_delays_stiffness_and_clear_gains_alone() -> None:
 
 
 def bench(rows: tuple[str, ...], far_share: float = 0.0) -> Any:
-    arm = SimpleNamespace(
-        presliding=np.array([0.0, 0.01]), far=np.array([0.0, 0.1]), far_share=np.array([0.0, far_share])
+    arm = NominalArm(
+        None,  # type: ignore[arg-type]
+        np.zeros(2),
+        np.ones(2),
+        presliding=np.array([0.0, 0.01]),
+        far=np.array([0.0, 0.1]),
+        far_share=np.array([0.0, far_share]),
     )
     return SimpleNamespace(nominal=SimpleNamespace(arm=arm, rows=dict.fromkeys(rows)))
 

@@ -17,6 +17,7 @@ from ident.dynamics.parameters import LINK_FRICTION
 from ident.dynamics.structure import Condition, ModelStructure
 from ident.effects import PRESLIDING, parameter_values
 from ident.effects.motion import dahl
+from ident.estimation.validate import validate
 from ident.model import DynamicModel
 from lwr_driver.session import Session
 
@@ -55,6 +56,16 @@ def test_the_healthy_drives_turn_over_their_path_and_are_late_by_their_delay(ref
     assert reference.presliding is not None
     np.testing.assert_allclose(reference.presliding, LENGTH, rtol=0.2)
     assert reference.motor_delay_s == pytest.approx(LATE_S, abs=5e-4)
+
+
+def test_the_model_of_a_reference_turns_its_friction_as_the_healthy_arm(
+    make: Make, reference: Reference
+) -> None:
+    turning = [entry for entry in reference.model.effects if entry["cause"] == PRESLIDING.cause]
+    assert [entry["joints"] for entry in turning] == [[1], [2], [3]]
+    (score,) = validate(reference.model, alone(make, 61)[:1], allow_seen=True).scores
+    (signs,) = validate(replace(reference.model, effects=()), alone(make, 61)[:1], allow_seen=True).scores
+    assert score.relative["motor"] < 0.5 * signs.relative["motor"]
 
 
 def test_more_friction_is_wear_of_its_joint(make: Make, chain: Chain, reference: Reference) -> None:
