@@ -305,13 +305,12 @@ class State:
         )
 
     def unusual(self, trial: Trial) -> bool:
-        """Whether a trial is more than on a healthy arm: its gain, or that of its difference from the usual size."""
-        if trial.score.gain > self.usual(trial):
-            return True
+        """Whether a trial is more than on a healthy arm: its difference from the usual size, or its gain where that size
+        is unknown."""
         usual = self.healthy.sizes.get(trial.candidate.key)
         here = None if usual is None else self.dictionary.scored(trial.candidate, usual[0].shape)
         if usual is None or here is None:
-            return False
+            return trial.score.gain > self.usual(trial)
         size, limit = usual
         change = size.beyond(here)
         other = trial.score.gain - max(here.gain, 0.0)
