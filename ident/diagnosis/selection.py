@@ -305,18 +305,20 @@ class State:
         )
 
     def unusual(self, trial: Trial) -> bool:
-        """Whether a trial is more than on a healthy arm: its difference from the usual size, or its gain where that size
-        is unknown."""
-        usual = self.healthy.sizes.get(trial.candidate.key)
-        here = None if usual is None else self.dictionary.scored(trial.candidate, usual[0].shape)
+        """Whether a trial is more than on a healthy arm: its difference from the usual size. Its gain alone suffices
+        where the healthy sets have no clear size."""
+        candidate, more = trial.candidate, trial.score.gain > self.usual(trial)
+        usual = self.healthy.sizes.get(candidate.key)
+        here = None if usual is None else self.dictionary.scored(candidate, usual[0].shape)
         if usual is None or here is None:
-            return trial.score.gain > self.usual(trial)
+            return more
         size, limit = usual
         change = size.beyond(here)
         other = trial.score.gain - max(here.gain, 0.0)
         # Days alike by chance have a limit below that of noise.
-        limit = max(self._limit(trial.candidate, limit, size.shape), self._least(trial.candidate, here))
-        return change > 0.0 and change + other > limit
+        limit = max(self._limit(candidate, limit, size.shape), self._least(candidate, here))
+        changed = change > 0.0 and change + other > limit
+        return changed or (more and not size.clear(here, self._limit(candidate, size.scatter, size.shape)))
 
     def _least(self, candidate: Candidate, score: Score) -> float:
         """Least gain of a claim."""

@@ -67,6 +67,10 @@ class UsualSize:
         change, usual = self._gain(score, away), (_LARGEST_SHARE**2) * self._gain(score, self.mean)
         return change if change > usual else 0.0
 
+    def clear(self, score: Score, scatter: float) -> bool:
+        """Whether the mean size would show in the rows of a score, beyond the scatter of the sets [gain] there."""
+        return self._alike(score) and self._gain(score, self.mean) > _THERE * max(scatter, 1.0)
+
     def _alike(self, score: Score) -> bool:
         return score.coefficients.shape == self.mean.shape
 

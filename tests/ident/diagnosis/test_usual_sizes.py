@@ -77,14 +77,17 @@ def test_a_constant_misfit_hides_no_change_of_the_same_candidate() -> None:
         scored=lambda candidate, shape: trial.score if shape == "v" else None,
     )
 
-    def state(mean: float, limit: float) -> State:
-        sizes = {KEY: (UsualSize("v", np.array([mean]), 1.0), limit)}
-        healthy = Healthy({KEY: 1000.0}, {KEY: {"v": 100.0}}, sizes)
+    def state(mean: float, change: float, *, limit: float = 1000.0, scatter: float = 1.0) -> State:
+        sizes = {KEY: (UsualSize("v", np.array([mean]), scatter), change)}
+        healthy = Healthy({KEY: limit}, {KEY: {"v": 100.0}}, sizes)
         return State(dictionary, None, DiagnosisSettings(), healthy)  # type: ignore[arg-type]
 
     assert state(1.0, 50.0).unusual(trial)
     assert not state(1.0, 150.0).unusual(trial)
     assert not state(2.0, 50.0).unusual(trial)
+    # A gain above that of the healthy days is a finding unless their size is clear and explains it.
+    assert state(2.0, 150.0, limit=100.0, scatter=1e3).unusual(trial)
+    assert not state(2.0, 150.0, limit=100.0).unusual(trial)
     # However alike the days were, a change is more than a claim asks for.
     assert state(1.4, 1.0).unusual(trial)
     assert not state(1.5, 1.0).unusual(trial)
