@@ -97,11 +97,12 @@ class TorqueErrors(NamedTuple):
         one is more than the whole of a small one. Infinite where a side's error is felt to be larger or one is missing,
         one where the base model has none.
         """
-        if not len(base.joints):
+        if not np.isfinite(base.joints).any():
             return 1.0
         if self.joints.shape != base.joints.shape or np.any(self.sides > (1.0 + FELT_WORSE) * base.sides):
             return np.inf
-        return float(np.mean((self.joints / np.maximum(base.joints, 1e-12)) ** 2))
+        squares = (self.joints / np.maximum(base.joints, 1e-12)) ** 2
+        return float(np.mean(squares[np.isfinite(squares)]))
 
 
 def nameless_terms(
