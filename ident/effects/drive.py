@@ -443,6 +443,8 @@ class _Ripple(Form):
     )
 
 
+# Least phase of a ripple that is another one [rad].
+_TURNED = 0.1
 # Delays of a ripple to begin with [s].
 _RIPPLE_DELAYS = (0.0, 0.01, 0.025, 0.045)
 
@@ -497,7 +499,10 @@ class GearRipple(Effect):
         return tuple(Column(motor=share * one) for share in (forward, 1.0 - forward) for one in waves)
 
     def follows_from(self, shape: Shape, coefficients: Floats, other: Effect, at: Shape, of: Floats) -> bool:
-        """Whether the controller makes it from a larger ripple of the joint torque sensor's reading."""
+        """Whether the controller makes it from a larger ripple of the joint torque sensor's reading, or another zero of
+        the joint turns the phase of the healthy one."""
+        if other.cause == "joint_zero_offset":
+            return shape["cycles_per_turn"] * shape["gear_ratio"] * float(np.abs(of[0])) > _TURNED
         if other.cause != "sensor_ripple":
             return False
         same = (shape["cycles_per_turn"], shape["gear_ratio"]) == (at["cycles_per_turn"], at["ratio"])

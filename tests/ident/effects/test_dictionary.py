@@ -323,3 +323,11 @@ def test_a_part_far_from_its_neighbours_has_the_step_of_the_whole(motion: ArmMot
     around = motion.part(slice(500, 600)).around(0.01)
     assert around.time[0] < motion.time[500] - 0.01
     assert around.time[-1] > motion.time[599] + 0.01
+
+
+def test_another_zero_of_a_joint_turns_the_phase_of_its_ripple() -> None:
+    ripple, zero = EFFECTS["gear_ripple"], EFFECTS["joint_zero_offset"]
+    shape, some = Shape(cycles_per_turn=2.0, gear_ratio=100.0), np.array([0.1, 0.0])
+    assert ripple.follows_from(shape, some, zero, Shape(), np.array([-2e-3]))
+    assert not ripple.follows_from(shape, some, zero, Shape(), np.array([2e-4]))
+    assert not ripple.follows_from(shape, some, EFFECTS["base_tilt"], Shape(), np.array([2e-3, 0.0]))
