@@ -494,7 +494,9 @@ def _setting(nominal: Nominal, *, compared: bool) -> Setting:
         speed_range=np.max([np.abs(m.motor_speed).max(axis=0) for m in motions], axis=0),
         position_range=np.stack([q.min(axis=0), q.max(axis=0)], axis=1),
         encoder=arm.encoder if arm.encoder_known else None,
-        presliding=arm.presliding,
+        presliding=None
+        if arm.presliding is None
+        else np.maximum(arm.presliding, arm.usual_length * (arm.presliding == 0.0)),
         standstill_rad_s=nominal.settings.standstill_rad_s,
         compared=compared,
         compliance=arm.compliance if all(m.springs is not None for m in motions) else None,

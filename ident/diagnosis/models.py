@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
-from ident.diagnosis.evidence import Rows
+from ident.diagnosis.evidence import Floats, Rows
 from ident.diagnosis.extension import Member, TorqueErrors, held_out_with, nameless_terms
 from ident.diagnosis.held_out import HeldOut
 from ident.diagnosis.nominal import GAIN_STD
 from ident.diagnosis.result import Finding, Nameless
 from ident.diagnosis.selection import Selection
 from ident.diagnosis.task import Baseline, ModelFit, State, Task
-from ident.diagnosis.tolerances import COMPLIANCE, GAIN, LENGTH, SIZE
+from ident.diagnosis.tolerances import COMPLIANCE, GAIN, LENGTH, SIZE, TURNING
 from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of, parameter_values, sized
 from ident.estimation.turning import drive_coulomb
 from ident.model import DynamicModel
@@ -121,13 +121,21 @@ def turning_friction(
     if "motor" not in nominal.rows:
         return []
     level = drive_coulomb(model, sensed="joint" in nominal.rows)
-    taken = np.zeros(len(level))
     for entry in found:
         if entry["cause"] == PRESLIDING.cause:
-            taken[entry["joints"][0] - 1] += parameter_values(entry)["amplitude"]
-    names = (f"{LENGTH} {joint + 1}" for joint in range(len(level)))
-    longer = np.exp([selection.nuisance.get(name, (0.0, 0.0))[0] for name in names])
-    return nominal.arm.turning(np.maximum(level - taken, 0.0), longer)
+            level[entry["joints"][0] - 1] -= parameter_values(entry)["amplitude"]
+    level = np.maximum(level, 0.0)
+
+    def told(kind: str) -> Floats:
+        """Value over `_CLEAR` standard deviations of a tolerated deviation (n,), else 0."""
+        pairs = [selection.nuisance.get(f"{kind} {joint + 1}", (0.0, 0.0)) for joint in range(len(level))]
+        return np.array([value if abs(value) > _CLEAR * std else 0.0 for value, std in pairs])
+
+    unknown = replace(nominal.arm, presliding=np.where(told(TURNING) > 0.0, nominal.arm.usual_length, 0.0))
+    return [
+        *nominal.arm.turning(level, np.exp(told(LENGTH))),
+        *unknown.turning(level * np.minimum(told(TURNING), 1.0)),
+    ]
 
 
 def without_harm(

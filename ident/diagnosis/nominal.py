@@ -96,6 +96,13 @@ class NominalArm:
         """Delays of the channels [s], as in the signal settings of a model."""
         return {"motor_delay_s": self.motor_delay_s, "joint_delay_s": self.joint_delay_s}
 
+    @property
+    def usual_length(self) -> float:
+        """Presliding length [rad] of a drive of this arm where its own is unknown: the geometric mean of the others, 0
+        without any."""
+        known = np.zeros(0) if self.presliding is None else self.presliding[self.presliding > 0.0]
+        return float(np.exp(np.mean(np.log(known)))) if len(known) else 0.0
+
     def turning(self, level: Floats, longer: Floats | float = 1.0) -> list[dict[str, Any]]:
         """Entries of a model for Coulomb friction (n,) [Nm] that turns over the arm's lengths, `longer` times the near
         ones (n,)."""

@@ -34,6 +34,8 @@ _KNOWN_DELAY = 0.4
 _KNOWN_COMPLIANCE = 0.4
 # Largest factor on a presliding length from day to day, and that of the two lengths of its column.
 _LONGEST, _APART = 5.0, 1.5
+# Largest share of friction that turns, with some room.
+_WHOLE = 1.3
 # Standard deviation of a further day from the mean of two, over that of a day.
 _FURTHER = 1.5**0.5
 
@@ -45,6 +47,8 @@ COMPLIANCE = "compliance"
 """The same for a joint's compliance."""
 LENGTH = "presliding"
 """The same for the presliding length of a drive, the logarithm of the factor on it."""
+TURNING = "turning"
+"""The same for friction that turns over the usual length where that of the drive is unknown, a share of it."""
 SIZE = "size"
 """The same for one of the healthy arm's own effects, a share of it, before its number among them."""
 
@@ -91,6 +95,10 @@ def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSe
         found += [
             Tolerance(f"{LENGTH} {j + 1}", rows, 1.0, np.log(_LONGEST), (PRESLIDING.cause, j))
             for j, rows in _presliding_rows(dictionary).items()
+        ]
+        found += [
+            Tolerance(f"{TURNING} {j + 1}", rows, 1.0, _WHOLE, (PRESLIDING.cause, j))
+            for j, rows in _turning_rows(dictionary).items()
         ]
         found += _sizes(dictionary, evidence, settings.least_gain)
     return found
@@ -167,6 +175,24 @@ def _presliding_rows(dictionary: Dictionary) -> dict[int, Rows]:
             scale = float(motion.motor_coulomb[joint]) / (2.0 * np.log(_APART))
             longer, shorter = (np.asarray(PRESLIDING.columns(motion, joint, one)[0].motor) for one in near)
             return [Column(motor=scale * (longer - shorter))]
+
+        found[joint] = {("motor", joint): nominal.columns(made, ["motor"])["motor"][0][:, None]}
+    return found
+
+
+def _turning_rows(dictionary: Dictionary) -> dict[int, Rows]:
+    """Rows of friction that turns over the usual length of the arm's drives, less its sign, by joint from 0, where no
+    length of its own was found."""
+    nominal = dictionary.nominal
+    length = nominal.arm.usual_length
+    if not length or nominal.arm.presliding is None or "motor" not in nominal.rows:
+        return {}
+    found: dict[int, Rows] = {}
+    for joint in np.flatnonzero((nominal.arm.presliding == 0.0) & nominal.moving).tolist():
+
+        def made(motion: ArmMotion, joint: int = joint) -> list[Column]:
+            (column,) = PRESLIDING.columns(motion, joint, Shape(length=length))
+            return [Column(motor=float(motion.motor_coulomb[joint]) * np.asarray(column.motor))]
 
         found[joint] = {("motor", joint): nominal.columns(made, ["motor"])["motor"][0][:, None]}
     return found

@@ -58,6 +58,19 @@ def test_the_healthy_drives_turn_over_their_path_and_are_late_by_their_delay(ref
     assert reference.motor_delay_s == pytest.approx(LATE_S, abs=5e-4)
 
 
+def test_a_drive_of_unknown_length_turns_over_that_of_the_others(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    assert reference.presliding is not None
+    unknown = replace(reference, presliding=reference.presliding * [1.0, 0.0, 1.0])
+    found = diagnose(alone(make, 31), chain, reference=unknown)
+    assert not found.findings
+    turning = [entry for entry in found.base_model.effects if entry["cause"] == PRESLIDING.cause]
+    (own,) = (parameter_values(entry) for entry in turning if entry["joints"] == [2])
+    assert own["length"] == pytest.approx(LENGTH, rel=0.2)
+    assert own["amplitude"] == pytest.approx(found.base_model.drive()["Fcm"][1], rel=0.1)
+
+
 def test_the_model_of_a_reference_turns_its_friction_as_the_healthy_arm(
     make: Make, reference: Reference
 ) -> None:
