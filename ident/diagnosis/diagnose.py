@@ -139,17 +139,17 @@ def _bench(task: Task) -> DiagnosisBench:
 
 
 def _begun(task: Task) -> tuple[Task, State]:
-    """The task with the presliding lengths of these days, and its first selection; a claim of presliding pulls at the
-    length of its drive, which is the usual one then."""
+    """The task with the presliding lengths of these days, and its first selection. A claim of presliding pulls at the
+    length of its drive, and a late motor, which reverses later, at all of them: these are the usual ones then."""
     usual = task.arm.presliding
     task, bench = _of_these_days(task)
     first = _first(task, bench)
     if usual is None or task.arm.presliding is None:
         return task, first
     claims = [claim.trial.candidate for claim in first.selection.claims]
-    claimed = [candidate.joint for candidate in claims if candidate.effect is PRESLIDING]
-    lengths = task.arm.presliding.copy()
-    lengths[claimed] = usual[claimed]
+    pulled = np.array([(PRESLIDING.cause, joint) in [c.key for c in claims] for joint in range(len(usual))])
+    pulled |= any(candidate.effect is DELAYS["motor"] for candidate in claims)
+    lengths = np.where(pulled, usual, task.arm.presliding)
     if np.array_equal(lengths, task.arm.presliding):
         return task, first
     task = replace(task, arm=replace(task.arm, presliding=lengths))
