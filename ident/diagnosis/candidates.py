@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
 from ident.diagnosis.nominal import Nominal, SideRows
 from ident.diagnosis.recording import sensor_limits
+from ident.diagnosis.settings import A_COEFFICIENT
 from ident.effects import DELAYS, EFFECTS, Effect, Setting, Shape
 from ident.rows.data_quality import run_bounds
 from lwr_driver.session.spool import Arena
@@ -23,8 +24,6 @@ _WINDOW_S, _FAR, _LONGEST_S, _MOST = 0.1, 8.0, 4.0, 4
 _EDGE_S = 0.6
 # The same from a standstill of the whole arm, and its least length: joints stick and links ring there.
 _BESIDE_REST_S, _REST_S = 0.3, 0.2
-# Least gain of a further coefficient of the same cause.
-_A_COEFFICIENT = 6.0
 # Standard deviation of a coefficient equal to 1 by physics, for the gain on held-back parts.
 _ABOUT_ONE = 0.3
 # Least fall of the chi-square for a common search of a shape's parameters.
@@ -460,7 +459,7 @@ def _acts(rows: Rows) -> bool:
 
 def _worth(score: Score) -> float:
     """Gain minus the gain of further coefficients by chance."""
-    return score.gain - _A_COEFFICIENT * len(score.coefficients)
+    return score.gain - A_COEFFICIENT * len(score.coefficients)
 
 
 def _alike(a: Shape, b: Shape, besides: str) -> bool:
@@ -496,7 +495,7 @@ def _setting(nominal: Nominal, *, compared: bool) -> Setting:
         encoder=arm.encoder if arm.encoder_known else None,
         presliding=None
         if arm.presliding is None
-        else np.maximum(arm.presliding, arm.usual_length * (arm.presliding == 0.0)),
+        else np.where(arm.presliding > 0.0, arm.presliding, arm.usual_length),
         standstill_rad_s=nominal.settings.standstill_rad_s,
         compared=compared,
         compliance=arm.compliance if all(m.springs is not None for m in motions) else None,

@@ -211,12 +211,10 @@ def _carried(trials: Sequence[Trial | None], settings: DiagnosisSettings) -> boo
         effect.usual_change,
         blocks=sum(s.robust()[1] for s in scores),
     )
-    strict = effect.evidence_factor
-    least = strict * (settings.least_gain + 6.0 * (len(size.mean) - 1))
     visible = float(np.mean([score.inflation for score in scores]))
     return (
-        _gain(trials) > least
-        and visible > strict * settings.least_inflation
+        _gain(trials) > settings.least_of_claim(effect.evidence_factor, len(size.mean))
+        and visible > effect.evidence_factor * settings.least_inflation
         and size.p_value < settings.alpha
         and size.lasting
     )
@@ -251,4 +249,4 @@ def _entry(candidate: Candidate, shape: Shape, coefficients: Floats, std: Floats
     effect = candidate.effect
     linear = {p.name: (c, s) for p, c, s in zip(effect.linear, coefficients, std, strict=False)}
     values = linear | {name: (value, 0.0) for name, value in shape.items()}
-    return entry_of(effect, candidate.joints, values, None if shape.form is None else str(shape.form.value))
+    return entry_of(effect, candidate.joints, values, shape.form_name)

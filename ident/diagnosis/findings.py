@@ -23,7 +23,7 @@ from ident.rows.data_quality import SampleLoss
 
 def finding_of(claim: Claim, bench: DiagnosisBench, without: HeldOut, after: HeldOut, seed: int) -> Finding:
     """The finding of a claim beside the columns of the evidence, with all other claims among them."""
-    candidate, score, form = claim.trial.candidate, claim.score, claim.trial.shape.form
+    candidate, score = claim.trial.candidate, claim.score
     keys = [key for key in claim.trial.rows if np.any(claim.trial.rows[key])]
     keys = sorted(keys, key=lambda key: -_relative(without, after, key))[: max(1, len(keys) // 7)]
     rms_before, rms_after, low, high = interval(without, after, keys, seed)
@@ -47,7 +47,7 @@ def finding_of(claim: Claim, bench: DiagnosisBench, without: HeldOut, after: Hel
         tell_apart=candidate.effect.tell_apart.format(joint=candidate.joint + 1),
         gain=score.gain,
         mode=candidate.effect.mode(claim.trial.shape),
-        form=None if form is None else str(form.value),
+        form=claim.trial.shape.form_name,
     )
 
 
@@ -155,7 +155,7 @@ def limit_findings(records: Sequence[SessionRecord], found: Sequence[Finding]) -
                 (),
                 SENSOR_SATURATION.tell_apart.format(joint=joint + 1),
                 0.0,
-                form=str(getattr(shape.form, "value", "")),
+                form=shape.form_name,
             )
         )
     return told

@@ -322,9 +322,7 @@ class State:
 
     def _least(self, candidate: Candidate, score: Score) -> float:
         """Least gain of a claim."""
-        return candidate.effect.evidence_factor * (
-            self.settings.least_gain + 6.0 * (len(score.coefficients) - 1)
-        )
+        return self.settings.least_of_claim(candidate.effect.evidence_factor, len(score.coefficients))
 
     def _limit(self, candidate: Candidate, limit: float, shape: str) -> float:
         """The limit of a gain in sessions with as much information on a candidate of a shape.

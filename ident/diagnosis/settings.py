@@ -8,6 +8,9 @@ from fri.errors import ConfigurationError
 from ident.dynamics.structure import Coulomb
 from ident.rows.filters import SignalSettings
 
+A_COEFFICIENT = 6.0
+"""Least gain of a further coefficient of the same cause."""
+
 
 @dataclass(frozen=True)
 class DiagnosisSettings:
@@ -65,3 +68,7 @@ class DiagnosisSettings:
             raise ConfigurationError("`jobs` is 0; give a number of threads, or -1 for one a core")
         if self.folds < 2:
             raise ConfigurationError(f"`folds` is {self.folds}; cross-validation needs at least 2")
+
+    def least_of_claim(self, factor: float, coefficients: int) -> float:
+        """Least gain of a claim with so many coefficients and `factor` times the usual evidence."""
+        return factor * (self.least_gain + A_COEFFICIENT * (coefficients - 1))

@@ -6,7 +6,7 @@ torque sensors, the presliding lengths of the drives, and the sizes of the healt
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -92,14 +92,7 @@ def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSe
             Tolerance(f"{GAIN} {j + 1}", rows, 1.0, size, (SENSOR_GAIN.cause, j))
             for j, rows in gain_rows(dictionary).items()
         ]
-        found += [
-            Tolerance(f"{LENGTH} {j + 1}", rows, 1.0, np.log(_LONGEST), (PRESLIDING.cause, j))
-            for j, rows in _presliding_rows(dictionary).items()
-        ]
-        found += [
-            Tolerance(f"{TURNING} {j + 1}", rows, 1.0, _WHOLE, (PRESLIDING.cause, j))
-            for j, rows in _turning_rows(dictionary).items()
-        ]
+        found += _lengths(dictionary)
         found += _sizes(dictionary, evidence, settings.least_gain)
     return found
 
@@ -161,38 +154,25 @@ def gain_rows(dictionary: Dictionary) -> dict[int, Rows]:
     return {j: rows for j, rows in found.items() if rows}
 
 
-def _presliding_rows(dictionary: Dictionary) -> dict[int, Rows]:
-    """Rows of a change of the logarithm of the drives' presliding lengths, by joint from 0, where the arm has one."""
-    nominal = dictionary.nominal
-    lengths = nominal.arm.presliding
-    if lengths is None or "motor" not in nominal.rows:
-        return {}
-    found: dict[int, Rows] = {}
-    for joint in np.flatnonzero((lengths > 0.0) & nominal.moving).tolist():
-        near = [Shape(length=float(lengths[joint]) * factor) for factor in (_APART, 1.0 / _APART)]
+def _lengths(dictionary: Dictionary) -> list[Tolerance]:
+    """Other presliding lengths of the drives; for a drive of unknown length, friction that turns over that of the
+    others."""
+    nominal, found = dictionary.nominal, list[Tolerance]()
+    lengths, usual = nominal.arm.presliding, nominal.arm.usual_length
+    if lengths is None or not usual or "motor" not in nominal.rows:
+        return found
+    for joint in np.flatnonzero(nominal.moving).tolist():
+        own = float(lengths[joint])
+        slope = 0.5 / np.log(_APART)
+        # Of the column: friction over each length, in units of the Coulomb friction.
+        parts = {own * _APART: slope, own / _APART: -slope} if own > 0.0 else {usual: 1.0}
 
-        def made(motion: ArmMotion, joint: int = joint, near: Sequence[Shape] = tuple(near)) -> list[Column]:
-            scale = float(motion.motor_coulomb[joint]) / (2.0 * np.log(_APART))
-            longer, shorter = (np.asarray(PRESLIDING.columns(motion, joint, one)[0].motor) for one in near)
-            return [Column(motor=scale * (longer - shorter))]
+        def made(motion: ArmMotion, joint: int = joint, parts: Mapping[float, float] = parts) -> list[Column]:
+            turned = (PRESLIDING.columns(motion, joint, Shape(length=length))[0].motor for length in parts)
+            total = sum(share * np.asarray(one) for share, one in zip(parts.values(), turned, strict=True))
+            return [Column(motor=float(motion.motor_coulomb[joint]) * np.asarray(total))]
 
-        found[joint] = {("motor", joint): nominal.columns(made, ["motor"])["motor"][0][:, None]}
-    return found
-
-
-def _turning_rows(dictionary: Dictionary) -> dict[int, Rows]:
-    """Rows of friction that turns over the usual length of the arm's drives, less its sign, by joint from 0, where no
-    length of its own was found."""
-    nominal = dictionary.nominal
-    length = nominal.arm.usual_length
-    if not length or nominal.arm.presliding is None or "motor" not in nominal.rows:
-        return {}
-    found: dict[int, Rows] = {}
-    for joint in np.flatnonzero((nominal.arm.presliding == 0.0) & nominal.moving).tolist():
-
-        def made(motion: ArmMotion, joint: int = joint) -> list[Column]:
-            (column,) = PRESLIDING.columns(motion, joint, Shape(length=length))
-            return [Column(motor=float(motion.motor_coulomb[joint]) * np.asarray(column.motor))]
-
-        found[joint] = {("motor", joint): nominal.columns(made, ["motor"])["motor"][0][:, None]}
+        rows = {("motor", joint): nominal.columns(made, ["motor"])["motor"][0][:, None]}
+        name, size = (LENGTH, np.log(_LONGEST)) if own > 0.0 else (TURNING, _WHOLE)
+        found.append(Tolerance(f"{name} {joint + 1}", rows, 1.0, size, (PRESLIDING.cause, joint)))
     return found

@@ -111,8 +111,13 @@ class Shape(Mapping[str, float]):
         return hash((self.form, tuple(self._values.items())))
 
     def __repr__(self) -> str:
-        parts = [] if self.form is None else [self.form.value]
+        parts = [] if self.form_name is None else [self.form_name]
         return f"Shape({', '.join([*parts, *(f'{name}={value:.6g}' for name, value in self.items())])})"
+
+    @property
+    def form_name(self) -> str | None:
+        """Name of its form as in files, None for the plain one."""
+        return None if self.form is None else str(self.form.value)
 
     @property
     def freedom(self) -> int:
