@@ -111,7 +111,7 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _delay_of(summary: Mapping[str, Any], side: str) -> str:
     """Delay of a side's torques against the motion in words, empty where it is none."""
-    sessions = summary["sessions"] if isinstance(summary.get("signals"), Mapping) else summary.get("signals")
+    sessions = summary.get("prepared", summary["sessions"])
     known = [
         (1e3 * one[f"{side}_delay_s"], 1e3 * (one.get(f"{side}_delay_std_s") or 0.0))
         for one in sessions or ()

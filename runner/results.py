@@ -217,7 +217,7 @@ def estimated(
     A session that cannot be scored is listed with its reason in `unscored`.
     """
     content = found.to_dict()
-    content["signals"] = content.pop("sessions")
+    content["prepared"] = content.pop("sessions")
     content["excitation"] = characteristics(found)
     for entry, interval in zip(content["parameters"], found.estimate.interval().tolist(), strict=True):
         entry["interval_95"] = interval

@@ -19,7 +19,6 @@ from ident.estimation.scores import Score, SessionScore, score_session
 from ident.estimation.validate import mounted, predictor, prepared_session, signals_for
 from ident.model import DynamicModel
 from ident.model.model_file import read_model
-from ident.model.signals import signal_settings
 from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepared import Passage, PreparedSession
 from lwr_driver.session import Session, read_session
@@ -246,11 +245,7 @@ class ResultFolder:
         """Measured and computed torque by session and side: held-out sessions last, loaded ones first."""
         if self.model is None:
             return ()
-        # A model of an earlier version has its cut-off in the summary only.
-        stated = [entry["cutoff_hz"] for entry in self.summary.get("signals", [])]
         settings = signals_for(self.model)
-        if signal_settings(self.model) is None and stated:
-            settings = replace(settings, cutoff_hz=float(np.median(stated)))
         found = []
         for entry in self.summary["sessions"]:
             session = self.sessions.get(entry["name"])

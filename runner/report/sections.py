@@ -72,7 +72,7 @@ def session_section(results: ResultFolder) -> str:
         parts.append(paragraph(text, "soft"))
     if results.unread:
         parts.append(paragraph(f"No log could be read of: {', '.join(results.unread)}.", "soft"))
-    if results.summary.get("signals"):
+    if results.summary.get("prepared"):
         parts.append(_signal_table(results))
     for name, items in results.preflights.items():
         label = f"Conditions before the motion of {name}"
@@ -84,20 +84,21 @@ def session_section(results: ResultFolder) -> str:
 def _signal_table(results: ResultFolder) -> str:
     """What the estimate made of each session: rows, lost samples, delays, cut-off."""
     rows: list[list[Cell]] = []
-    for number, entry in enumerate(results.summary["signals"]):
-        counts = (Number(entry[key], "d", f"signals.{number}.{key}") for key in ("rows", "lost_samples"))
+    for number, entry in enumerate(results.summary["prepared"]):
+        counts = (Number(entry[key], "d", f"prepared.{number}.{key}") for key in ("rows", "lost_samples"))
         delays = (
             entry.get(key)
             for key in ("motor_delay_s", "motor_delay_std_s", "joint_delay_s", "joint_delay_std_s")
         )
-        cutoff = Number(entry["cutoff_hz"], ".3g", f"signals.{number}.cutoff_hz")
+        cutoff = Number(entry["cutoff_hz"], ".3g", f"prepared.{number}.cutoff_hz")
         milliseconds = (Number(None if value is None else 1e3 * value, ".2f") for value in delays)
         rows.append([entry["name"], *counts, *milliseconds, cutoff])
     head = (
         "session", "rows", "lost samples", "motor torque late by [ms]", "± [ms]", "joint torque late by [ms]", "± [ms]",
         "cut-off [Hz]",
     )  # fmt: skip
-    return table(head, rows, "Signals of the estimate")
+    reasons = results.summary["signals"]["reasons"]
+    return table(head, rows, "Signals of the estimate") + "".join(paragraph(one, "soft") for one in reasons)
 
 
 def table_1_section(results: ResultFolder) -> str:

@@ -32,5 +32,5 @@ def session(motor: float | None, joint: float | None = None) -> dict[str, Any]:
 )
 def test_delays_in_use_are_told(sessions: list[dict[str, Any]], told: str | None) -> None:
     # As `Identification.to_dict` has them, and as summary.json.
-    for summary in ({"sessions": sessions, "signals": {"cutoff_hz": 5.0}}, {"signals": sessions}):
+    for summary in ({"sessions": sessions}, {"sessions": [], "prepared": sessions}):
         assert dict(numbers_of(summary)).get("delay") == told

@@ -84,7 +84,7 @@ def test_the_joint_estimate_is_sharper_than_that_of_the_first_round(twice: Finis
     assert np.median(ratios) < 0.7
     summary = json.loads((twice.folder / "summary.json").read_text(encoding="utf-8"))
     assert [entry["name"] for entry in summary["sessions"]][2:] == ["unloaded-round2", "loaded-round2"]
-    assert len(summary["signals"]) == 4
+    assert len(summary["prepared"]) == 4
 
 
 @pytest.mark.long

@@ -210,7 +210,10 @@ def test_a_motion_that_the_estimate_has_not_seen_stands_first_in_figure_3(
     finished: Path, report: Seen
 ) -> None:
     summary = json.loads((finished / "summary.json").read_text())
-    assert [entry["name"] for entry in summary["signals"]] == ["unloaded.mcap", "loaded.mcap"]
+    assert [entry["name"] for entry in summary["prepared"]] == ["unloaded.mcap", "loaded.mcap"]
+    reasons = summary["signals"]["reasons"]
+    assert reasons
+    assert all(report.page.get_by_text(one).count() == 1 for one in reasons)
     assert [(score["session"], score["seen"]) for score in summary["validation"]] == [("check.mcap", False)]
     titles = report.page.locator("#torque details > summary").all_inner_texts()
     assert titles[0].startswith("check, joint torque, held out: ")
