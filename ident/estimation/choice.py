@@ -41,7 +41,7 @@ from ident.estimation.identify import (
     identify,
     observed,
 )
-from ident.estimation.mounting import Mounting, find_mounting, tilt_columns, with_tilt
+from ident.estimation.mounting import Mounting, find_mounting, tilt_columns
 from ident.estimation.parts import beside, held_back_parts
 from ident.estimation.turning import Turning, friction_turning
 from ident.estimators.covariance import CovarianceSettings, effective_rows
@@ -280,15 +280,14 @@ def compared(
 class _Comparison:
     """Normal equations of the held-back parts: the parameters, two of the tilt, one gain a joint, the torque.
 
-    gains : columns of the gains of `joints`. total : (classes, q, q) of all rows. held : (parts, classes, q, q) of the
-    rows of a part. near : the same with the rows beside them, missing in the training.
-    weights : of the candidates so far.
+    further : columns (m, 2 + joints) of the tilt and the gains of `joints` for each group. total : (classes, q, q) of
+    all rows. held : (parts, classes, q, q) of the rows of a part. near : the same with the rows beside them, missing in
+    the training. weights : of the candidates so far.
     """
 
     problem: Problem
-    leaning: Problem | None
+    further: tuple[Floats, ...]
     bodies: BodyPrior | None
-    gains: NDArray[np.int64]
     joints: tuple[str, ...]
     total: Floats
     held: Floats
@@ -296,7 +295,7 @@ class _Comparison:
     block_s: float
     full_rank: bool
     unseen: tuple[str, ...]
-    weights: dict[tuple[str, float | None, bool], Floats] = field(default_factory=dict)
+    weights: dict[Kind, Floats] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -312,18 +311,19 @@ class _Comparison:
         joints = list(dict.fromkeys(group.joint for group in problem.groups if group.side == "joint"))
         offset = np.array([name.startswith("off") for name in problem.names])
         rigid = np.where(offset, 0.0, values)
-        extra = 2 + len(joints)
-        q = len(problem.names) + extra + 1
+        p, further = len(problem.names), list[Floats]()
+        q = p + 2 + len(joints) + 1
         held = np.zeros((count, len(problem.classes), q, q))
         near, total = np.zeros_like(held), np.zeros((len(problem.classes), q, q))
         for number, (group, part) in enumerate(zip(problem.groups, parts, strict=True)):
             matrix = np.zeros((len(group.target), q))
-            matrix[:, : len(values)] = group.matrix
+            matrix[:, :p] = group.matrix
             if lean is not None:
-                matrix[:, len(values) : len(values) + 2] = lean[number]
+                matrix[:, p : p + 2] = lean[number]
             if group.side == "joint":
-                matrix[:, len(values) + 2 + joints.index(group.joint)] = group.matrix @ rigid
+                matrix[:, p + 2 + joints.index(group.joint)] = group.matrix @ rigid
             matrix[:, -1] = group.target
+            further.append(matrix[:, p:-1].copy())
             row_class = problem.class_of_group[number]
             total[row_class] += matrix.T @ matrix
             for k in range(count):
@@ -333,9 +333,8 @@ class _Comparison:
                 near[k, row_class] += matrix[around].T @ matrix[around]
         return cls(
             problem,
-            None if lean is None else with_tilt(problem, lean),
+            tuple(further),
             bodies,
-            np.arange(len(values) + 2, len(values) + extra),
             tuple(joints),
             total,
             held,
@@ -455,28 +454,26 @@ class _Comparison:
 
     def _estimation(self, kind: Kind) -> tuple[NDArray[np.int64], Floats, Prior]:
         """A candidate's columns, weights (classes,) and prior."""
-        estimator, scale, tilt, gains = kind
-        inner = len(self.problem.names) + 2 * tilt
-        used = np.append(np.arange(inner), self.gains[list(gains)])
-        mean, precision = np.zeros(len(used)), np.zeros((len(used),) * 2)
-        if estimator != "wls" and scale is not None:
-            arm = self._prior(2 * tilt, _TILT_STD_RAD)
-            mean[:inner], precision[:inner, :inner] = arm.mean, arm.precision / scale
-        precision[range(inner, len(used)), range(inner, len(used))] = _GAIN_STD**-2
-        return used, self._weights(kind), Prior(mean, precision)
+        used = np.append(np.arange(len(self.problem.names)), len(self.problem.names) + self._further(kind))
+        return used, self._weights(kind), self._prior(kind)
+
+    def _further(self, kind: Kind) -> NDArray[np.int64]:
+        """A candidate's columns of `further`."""
+        return np.array([*range(2 * kind[2]), *(2 + gain for gain in kind[3])], dtype=np.int64)
 
     def _weights(self, kind: Kind) -> Floats:
-        """Weights (classes,) of a candidate, found once whatever its gains."""
-        estimator, scale, tilt, _ = kind
-        if kind[:3] not in self.weights:
-            problem = self.leaning if tilt and self.leaning is not None else self.problem
-            if estimator == "wls" or scale is None:
-                self.weights[kind[:3]] = WeightedLeastSquares(_PLAIN).fit(problem).weights
+        """Weights (classes,) of a candidate: a joint that a gain explains weighs more than without it."""
+        if kind not in self.weights:
+            further = self._further(kind)
+            columns = [matrix[:, further] for matrix in self.further]
+            problem = self.problem.with_columns([f"further_{k}" for k in further], columns, "")
+            physical = kind[0] == "physical"
+            if physical or kind[3]:
+                fit = MaximumAPosteriori(self._prior(kind), 1.0, _PLAIN).fit(problem)
             else:
-                arm = self._prior(2 * tilt, _TILT_STD_RAD)
-                fit = MaximumAPosteriori(arm, scale, _PLAIN).fit(problem)
-                self.weights[kind[:3]] = _tempered(problem, fit)
-        return self.weights[kind[:3]]
+                fit = WeightedLeastSquares(_PLAIN).fit(problem)
+            self.weights[kind] = _tempered(problem, fit) if physical else fit.weights
+        return self.weights[kind]
 
     def _solved(self, kind: Kind) -> tuple[Floats, Floats]:
         """Values (k,) and covariance (k, k) of a candidate from all rows."""
@@ -555,14 +552,17 @@ class _Comparison:
         """The same, with a weak prior of what the rows leave open."""
         return self._stated.completed(self.problem)
 
-    def _prior(self, extra: int, std: float) -> Prior:
-        """The URDF's prior of the parameters, and `extra` columns of mean zero and standard deviation `std`."""
-        arm = self._completed
-        p = len(arm.mean)
-        precision = np.zeros((p + extra, p + extra))
-        precision[:p, :p] = arm.precision
-        precision[range(p, p + extra), range(p, p + extra)] = std**-2
-        return Prior(np.append(arm.mean, np.zeros(extra)), precision)
+    def _prior(self, kind: Kind) -> Prior:
+        """The URDF's prior of a candidate's parameters, none for least squares, and that of its tilt and gains."""
+        _, scale, tilt, gains = kind
+        p = len(self.problem.names)
+        size = p + 2 * tilt + len(gains)
+        mean, precision = np.zeros(size), np.zeros((size, size))
+        precision[range(p + 2 * tilt, size), range(p + 2 * tilt, size)] = _GAIN_STD**-2
+        if scale is not None:
+            precision[range(p, p + 2 * tilt), range(p, p + 2 * tilt)] = _TILT_STD_RAD**-2
+            mean[:p], precision[:p, :p] = self._completed.mean, self._completed.precision / scale
+        return Prior(mean, precision)
 
     def _placeholder(self) -> Iterator[str]:
         if self.bodies is None:

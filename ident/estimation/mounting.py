@@ -31,14 +31,12 @@ from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Covariance, fisher_tail
 from ident.estimators.physical import cad_prior
 from ident.estimators.prior import MaximumAPosteriori, Prior
-from ident.estimators.problem import Problem
 from ident.rows.content import Recall
 from ident.rows.observation import observe
 from ident.rows.prepare import prepare
 from ident.rows.prepared import PreparedSession, TorqueChannel
 from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
-from lwr_driver.session.spool import stored
 
 
 @dataclass(frozen=True)
@@ -186,7 +184,7 @@ def _step(
     """One Gauss-Newton step (2,) with all base parameters free, and the covariance of the tilt."""
     gravity = found.structure.chain.gravity
     columns = _columns(found, sessions, list(sideways_gravity(gravity, axes)))
-    problem = with_tilt(found.problem, columns)
+    problem = found.problem.with_columns(("tilt_1", "tilt_2"), columns, "rad")
     estimator = MaximumAPosteriori(
         _prior(found, tilt, prior_std_rad), 1.0, CovarianceSettings(kind="jackknife")
     )
@@ -204,19 +202,6 @@ def tilt_columns(
     """d(torque) / d(tilt) (m, 2) [Nm/rad] of each row group, with the estimated parameters. recall : see `prepare`."""
     gravity = found.structure.chain.gravity
     return _columns(found, sessions, list(sideways_gravity(gravity, _axes(gravity))), recall)
-
-
-def with_tilt(problem: Problem, columns: Sequence[Floats]) -> Problem:
-    """The problem with two further columns for the tilt."""
-    groups = tuple(
-        replace(group, matrix=stored([np.column_stack([group.matrix, column])]))
-        for group, column in zip(problem.groups, columns, strict=True)
-    )
-    names, units = (
-        (*problem.names, "tilt_1", "tilt_2"),
-        (*problem.units, "rad", "rad") if problem.units else (),
-    )
-    return replace(problem, names=names, groups=groups, units=units)
 
 
 def _columns(

@@ -18,6 +18,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from fri.errors import DataError
 from ident.dynamics.parameters import Floats
+from lwr_driver.session.spool import stored
 
 _QR_ROWS = 4096
 _GRAM_PIVOT = 1e-5
@@ -248,6 +249,15 @@ class Problem:
             groups=tuple(group.select(chosen) for group in self.groups),
             units=tuple(self.units[c] for c in chosen) if self.units else (),
         )
+
+    def with_columns(self, names: Sequence[str], columns: Sequence[Floats], unit: str) -> Problem:
+        """The same rows with further parameters of one unit. columns : (m, k) of each group."""
+        groups = tuple(
+            replace(group, matrix=stored([np.column_stack([group.matrix, further])]))
+            for group, further in zip(self.groups, columns, strict=True)
+        )
+        units = (*self.units, *[unit] * len(names)) if self.units else ()
+        return replace(self, names=(*self.names, *names), groups=groups, units=units)
 
     def require_rank(self) -> float:
         """Condition number of the column-normalised stack. DataError names the parameters at a loss of rank."""

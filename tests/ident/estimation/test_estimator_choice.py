@@ -123,6 +123,19 @@ def test_a_sensor_that_reads_too_much_is_found_and_stated_as_an_effect():
     assert "joint torque sensors read too much by" in found.summary()
 
 
+def test_a_joint_that_a_gain_explains_weighs_by_what_is_left():
+    log = session(sensors=replace(SENSORS, joint=0.02), motor=False, periods=3)
+    effort = log.joint.effort.copy()
+    effort[:, 3] *= 1.08
+    found = identify(replace(log, joint=replace(log.joint, effort=effort)), chain(), MODEL_1)
+    assert found.choice is not None
+    # With the weights of the model without it: least squares, and a deviation of 0.0065.
+    assert found.choice.winner.estimator == "physical"
+    error, std = found.choice.gains["A3"]
+    assert error == pytest.approx(0.08, abs=3.0 * std)
+    assert std < 0.002
+
+
 def test_healthy_sensors_get_no_gain():
     assert chosen().choice is not None
     assert not chosen().choice.gains
