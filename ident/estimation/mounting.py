@@ -36,6 +36,7 @@ from ident.rows.observation import observe
 from ident.rows.prepare import prepare
 from ident.rows.prepared import PreparedSession, TorqueChannel
 from ident.rows.sessions import require
+from ident.screening.screen import without_dead
 from lwr_driver.session import Session, Sessions, as_sessions
 
 
@@ -227,7 +228,8 @@ def _columns(
             recall=recall,
         )
         still = _at_rest(moving)
-        result += [group.matrix for group in observe([still], [payload], leaning).groups]
+        rows = without_dead(observe([still], [payload], leaning), chosen)
+        result += [group.matrix for group in rows.groups]
     return result
 
 

@@ -283,13 +283,14 @@ def _stationary(
             series.append((values, rows, np.bincount(place, minlength=len(values)).astype(float)))
         covariance = np.zeros(_LAGS + 1)
         for lag in range(_LAGS + 1):
-            pairs = sum(float(there[lag:] @ there[: len(there) - lag]) for _, _, there in series)
-            power = sum(float(values[lag:] @ values[: len(values) - lag]) for values, _, _ in series)
+            longer = [(values, there) for values, _, there in series if len(values) > lag]
+            pairs = sum(float(there[lag:] @ there[: len(there) - lag]) for _, there in longer)
+            power = sum(float(values[lag:] @ values[: len(values) - lag]) for values, _ in longer)
             covariance[lag] = power / max(pairs, 1.0)
         count = row_class.factor.rows
         weak = np.flatnonzero(np.abs(covariance) < 2.0 / np.sqrt(max(count, 1)) * covariance[0])
         for lag in range(int(weak[0]) if len(weak) else len(covariance)):
-            for _, rows, _ in series:
+            for rows in (rows for _, rows, _ in series if len(rows) > lag):
                 product = covariance[lag] * (rows[lag:].T @ rows[: len(rows) - lag])
                 product *= count / max(count - used, 1.0)
                 total += product if lag == 0 else product + product.T

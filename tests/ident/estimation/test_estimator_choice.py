@@ -123,6 +123,15 @@ def test_a_sensor_that_reads_too_much_is_found_and_stated_as_an_effect():
     assert "joint torque sensors read too much by" in found.summary()
 
 
+def test_a_sensor_dead_in_one_session_leaves_the_choice_to_the_others():
+    first, second = (session(sensors=SENSORS, seed=seed, motor=False) for seed in (1, 2))
+    effort = second.joint.effort.copy()
+    effort[:, 3] = 0.0
+    found = identify([first, replace(second, joint=replace(second.joint, effort=effort))], chain(), MODEL_1)
+    assert found.choice is not None
+    assert any("A3 joint torque" in one and "dead" in one for one in found.warnings)
+
+
 def test_a_joint_that_a_gain_explains_weighs_by_what_is_left():
     log = session(sensors=replace(SENSORS, joint=0.02), motor=False, periods=3)
     effort = log.joint.effort.copy()

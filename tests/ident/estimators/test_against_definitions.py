@@ -841,8 +841,10 @@ def test_the_variance_of_stationary_residuals_is_that_of_their_toeplitz_matrix()
         times = np.arange(200) + np.where(np.arange(200) < 120, 0, gap)
         groups.append(RowGroup("A1", "joint", record, random.normal(size=(200, 2)), np.zeros(200), times))
         spread.append(ar1(random, times[-1] + 1, 0.4)[times])
-    groups.append(RowGroup("A1", "joint", 2, np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=int)))
-    spread.append(np.zeros(0))
+    for record, count in ((2, 0), (3, 3)):
+        few = np.arange(count)
+        groups.append(RowGroup("A1", "joint", record, random.normal(size=(count, 2)), np.zeros(count), few))
+        spread.append(random.normal(size=count))
     case = Problem(("a", "b"), tuple(groups), 0.1)
     lagged = []
     for lag in range(60):
@@ -854,14 +856,14 @@ def test_the_variance_of_stationary_residuals_is_that_of_their_toeplitz_matrix()
             )
         ]
         lagged.append(float(np.mean(pairs)))
-    until = next(lag for lag, value in enumerate(lagged) if abs(value) < 2.0 / np.sqrt(400) * lagged[0])
+    until = next(lag for lag, value in enumerate(lagged) if abs(value) < 2.0 / np.sqrt(403) * lagged[0])
     weight = np.array(lagged[:until] + [0.0] * 300)
     expected = sum(
         group.matrix.T @ weight[np.abs(np.subtract.outer(group.time_index, group.time_index))] @ group.matrix
         for group in groups
     )
     found = _stationary(case, spread, np.array([4.0]), None)
-    np.testing.assert_allclose(found, np.asarray(expected) * 400 / 396, rtol=1e-9)
+    np.testing.assert_allclose(found, np.asarray(expected) * 403 / 399, rtol=1e-9)
 
 
 def test_blocks_of_a_period_are_those_of_its_phase() -> None:
