@@ -132,27 +132,51 @@ def clipped(channel: str, field: str, share: float, *joints: str) -> Change:
     return lambda sessions: _channel(sessions, channel, edit)
 
 
-def constant(channel: str, field: str, value: float, *joints: str, only: int | None = None) -> Change:
-    """The joints read one value all the time, in all sessions or one."""
+def shifted(channel: str, field: str, value: float, *joints: str) -> Change:
+    """One field of the joints with another zero."""
+
+    def edit(columns: JointColumns) -> JointColumns:
+        values = getattr(columns, field).copy()
+        values[:, [JOINTS.index(name) for name in joints]] += value
+        return replace(columns, **{field: values})
+
+    return lambda sessions: _channel(sessions, channel, edit)
+
+
+def in_one(change: Change, number: int = 0) -> Change:
+    """The change in one session, the others as they were."""
+    return lambda sessions: [
+        done if k == number else session
+        for k, (session, done) in enumerate(zip(sessions, change(sessions), strict=True))
+    ]
+
+
+def from_the_middle(channel: str, field: str, change: Change) -> Change:
+    """The change of one field from half of the first session on."""
+
+    def whole(sessions: Sessions) -> Sessions:
+        before, after = (getattr(one[0], channel) for one in (sessions, change(sessions)))
+        values = getattr(before, field).copy()
+        values[len(values) // 2 :] = getattr(after, field)[len(values) // 2 :]
+        changed: dict[str, Any] = {channel: replace(before, **{field: values})}
+        return [replace(sessions[0], **changed), *sessions[1:]]
+
+    return whole
+
+
+def constant(channel: str, field: str, value: float, *joints: str) -> Change:
+    """The joints read one value all the time."""
 
     def edit(columns: JointColumns) -> JointColumns:
         values = getattr(columns, field).copy()
         values[:, [JOINTS.index(name) for name in joints]] = value
         return replace(columns, **{field: values})
 
-    def change(sessions: Sessions) -> Sessions:
-        done = _channel(sessions, channel, edit)
-        return (
-            done
-            if only is None
-            else [d if k == only else s for k, (s, d) in enumerate(zip(sessions, done, strict=True))]
-        )
-
-    return change
+    return lambda sessions: _channel(sessions, channel, edit)
 
 
-def frozen(channel: str, field: str, joint: str, *, only: int | None = None) -> Change:
-    """The joint keeps the value of a quarter of the log until three quarters, in all sessions or one."""
+def frozen(channel: str, field: str, joint: str) -> Change:
+    """The joint keeps the value of a quarter of the log until three quarters."""
 
     def edit(columns: JointColumns) -> JointColumns:
         values, k = getattr(columns, field).copy(), JOINTS.index(joint)
@@ -160,12 +184,7 @@ def frozen(channel: str, field: str, joint: str, *, only: int | None = None) -> 
         values[first:last, k] = values[first, k]
         return replace(columns, **{field: values})
 
-    return lambda sessions: [
-        done if only in (None, number) else session
-        for number, (session, done) in enumerate(
-            zip(sessions, _channel(sessions, channel, edit), strict=True)
-        )
-    ]
+    return lambda sessions: _channel(sessions, channel, edit)
 
 
 def paced(
@@ -334,12 +353,21 @@ CASES: tuple[Case, ...] = (
     Case("motor A6 reads 0", constant(*M, 0.0, "A6"), (MOTOR, "A6")),
     Case("joint A2 reads 12.3", constant(*L, 12.3, "A2"), (JOINT, "A2")),
     Case("position A5 reads 0.4", constant(*Q, 0.4, "A5"), (POSITION, "A5")),
-    Case("position A5 reads 0.4 in one log", constant(*Q, 0.4, "A5", only=0), (POSITION, "A5")),
+    Case("position A5 reads 0.4 in one log", in_one(constant(*Q, 0.4, "A5")), (POSITION, "A5")),
     Case("motor A2 frozen half the time", frozen(*M, "A2"), (MOTOR, "A2")),
-    Case("motor A6 frozen half of one log", frozen(*M, "A6", only=0), (MOTOR, "A6")),
+    Case("motor A6 frozen half of one log", in_one(frozen(*M, "A6")), (MOTOR, "A6")),
     Case("joint A1 frozen half the time", frozen(*L, "A1"), (JOINT, "A1")),
-    Case("joint A4 frozen half of one log", frozen(*L, "A4", only=0), (JOINT, "A4")),
-    Case("position E1 frozen half of one log", frozen(*Q, "E1", only=0), (POSITION, "E1")),
+    Case("joint A4 frozen half of one log", in_one(frozen(*L, "A4")), (JOINT, "A4")),
+    Case("position E1 frozen half of one log", in_one(frozen(*Q, "E1")), (POSITION, "E1")),
+    # In one of the logs, or from some moment on.
+    Case("motor A2 sign in one log", in_one(scaled(*M, -1.0, "A2"), 1), (MOTOR, "A2")),
+    Case("joint A3 in kNm in one log", in_one(scaled(*L, 1e-3, "A3")), (JOINT, "A3")),
+    Case("joint A4 x 1.4 in one log", in_one(scaled(*L, 1.4, "A4"), 1), (JOINT, "A4")),
+    Case("motor A3/A4 swapped in one log", in_one(swapped(*M, "A3", "A4"), 1), (MOTOR, "A3", "A4")),
+    Case("joint A2 20 Nm off in one log", in_one(shifted(*L, 20.0, "A2")), (JOINT, "A2")),
+    Case("motor A4 sign from the middle", from_the_middle(*M, scaled(*M, -1.0, "A4")), (MOTOR, "A4")),
+    Case("joint A2 halved from the middle", from_the_middle(*L, scaled(*L, 0.5, "A2")), (JOINT, "A2")),
+    Case("position E1 8 deg off in one log", in_one(turned(8.0, "E1"), 1), (POSITION, "E1")),
     # One torque alone.
     Case("motor torques as joint torques", mistaken, (JOINT, "motor torques")),
     Case("joint only: A2 x 1.3", without("motor", scaled(*L, 1.3, "A2")), (JOINT, "A2")),

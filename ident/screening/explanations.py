@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.dynamics.parameters import Floats
-from ident.screening.redundancy import Class, Gain, Redundancy
+from ident.screening.parts import PartError, part_errors, scopes
+from ident.screening.redundancy import Class, Fit, Gain, Normal, Part, Redundancy
 
 # Ratios of units often mixed up, with their names.
 UNITS = {
@@ -29,6 +30,8 @@ UNITS = {
 _NEAR = 0.1
 # Residual over torque of an arm whose channels agree; beyond it explanations are sought.
 AGREES = 0.1
+# Residual over torque of a joint, beyond which units, signs and other joints' torques are tried in parts of the data.
+_CONTRADICTS = 0.3
 # Least gain error of interest, and its standard deviations: sensors are calibrated to a few per cent.
 _GAIN, _DEVIATIONS = 0.18, 5.0
 # Largest share of the residual left by a true gain error.
@@ -44,7 +47,8 @@ _OFFSETS = (-np.pi, -0.5 * np.pi, 0.5 * np.pi)
 class Explanation:
     """A change of a channel: its name, the mended rows, and the fall of the score.
 
-    channel : as in `Doubt`. factor : recorded over true value, for a change of scale. gain : of a torque.
+    channel : as in `Doubt`. factor : recorded over true value, for a change of scale. gain : of a torque. parts,
+    error : the parts of the data with it, and its size there.
     """
 
     channel: str
@@ -55,6 +59,8 @@ class Explanation:
     factor: float = 1.0
     gain: Gain | None = None
     label: str = ""
+    error: PartError | None = None
+    parts: tuple[Part, ...] = ()
 
 
 def unit_of(factor: float) -> str:
@@ -90,18 +96,24 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
     normal = data.normal()
     fit = data.fit(normal)
     before, tried = fit.score, []
-    for candidate in _torques(data, data.gains(fit, normal)):
+
+    def scored(candidate: Explanation) -> tuple[Explanation, Fit]:
         after = candidate.mended.fit(normal, doubtful=False)
-        tried.append(replace(candidate, drop=before - after.score))
-        if believed(tried[-1], len(normal.classes)) and max(after.rho.values()) < AGREES:
+        return replace(candidate, drop=before - after.score), after
+
+    for candidate in _torques(data, data.gains(fit, normal)):
+        one, after = scored(candidate)
+        tried.append(one)
+        if believed(one, len(normal.classes)) and max(after.rho.values()) < AGREES:
             break
     else:
         for candidate in _motions(data):
             drop = before - candidate.mended.fit(doubtful=False).score
             tried.append(replace(candidate, drop=drop))
-    best = max(
-        (one for one in tried if believed(one, len(normal.classes))), key=lambda one: one.drop, default=None
-    )
+    tried += [scored(candidate)[0] for candidate in _of_parts(data, fit, normal)]
+    tried = [one for one in tried if believed(one, len(normal.classes))]
+    # Of the session as a whole before its half.
+    best = max(tried, key=lambda one: one.drop - _FINER * (len(one.parts) == 1), default=None)
     return None if best is None else _refined(best, before)
 
 
@@ -114,13 +126,50 @@ def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanat
                 continue
             scale = np.eye(data.chain.n)
             scale[joint, joint] = 1.0 / factor
-            mended = _mapped(data, side, scale)
+            mended = data.mapped(side, scale)
             yield Explanation(f"{side} torque", (joint,), unit_of(factor), mended, 0.0, factor)
     for side in data.sides:
         for a, b in _pairs(data):
             if (side, a) not in data.silent and (side, b) not in data.silent:
-                mended = _mapped(data, side, _exchange(data, a, b))
+                mended = data.mapped(side, _exchange(data, a, b))
                 yield Explanation(f"{side} torque", (a, b), "the two joints interchanged", mended)
+
+
+def _of_parts(data: Redundancy, fit: Fit, normal: Normal) -> Iterator[Explanation]:
+    """A torque with another gain, zero or unit in one session or half of it, or two joints interchanged there."""
+    eye = np.eye(data.chain.n)
+    doubtful = set()
+    for one in part_errors(data, fit, normal):
+        side, joint = one.key
+        doubtful.add((one.key, one.parts))
+        if one.kind == "zero":
+            mended = data.mapped(side, eye, -one.value * eye[joint], one.parts)
+            yield Explanation(f"{side} torque", (joint,), "another zero", mended, error=one, parts=one.parts)
+        else:
+            yield _scaled_part(data, one.key, one.parts, one.value, one)
+    for key in (key for key, rho in fit.rho.items() if rho > _CONTRADICTS):
+        doubtful |= {(key, parts) for parts in scopes(normal.parts)}
+    pairs = set()
+    for (side, joint), parts in sorted(doubtful):
+        yield from (_scaled_part(data, (side, joint), parts, factor) for factor in (-1.0, 1e3, 1e-3))
+        others = (
+            other for other in range(data.chain.n) if other != joint and (side, other) not in data.silent
+        )
+        pairs |= {(side, min(joint, other), max(joint, other), parts) for other in others}
+    for side, a, b, parts in sorted(pairs):
+        mended = data.mapped(side, _exchange(data, a, b), parts=parts)
+        yield Explanation(f"{side} torque", (a, b), "the two joints interchanged", mended, parts=parts)
+
+
+def _scaled_part(
+    data: Redundancy, key: Class, parts: tuple[Part, ...], factor: float, error: PartError | None = None
+) -> Explanation:
+    scale = np.eye(data.chain.n)
+    scale[key[1], key[1]] = 1.0 / factor
+    mended = data.mapped(key[0], scale, parts=parts)
+    return Explanation(
+        f"{key[0]} torque", (key[1],), unit_of(factor), mended, factor=factor, error=error, parts=parts
+    )
 
 
 def _motions(data: Redundancy) -> Iterator[Explanation]:
@@ -140,14 +189,14 @@ def _torque_gains(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Exp
             small = abs(gain.value) < 3.0 * gain.std
             looks = "a torque in a unit far too large, or none" if small else unit_of(gain.value)
             yield Explanation(
-                f"{side} torque", (joint,), looks, _mapped(data, side, scale), 0.0, gain.value, gain
+                f"{side} torque", (joint,), looks, data.mapped(side, scale), 0.0, gain.value, gain
             )
         middle = float(np.median([gain.value for gain in wrong.values()])) if wrong else 1.0
         alike = [joint for joint, gain in wrong.items() if abs(gain.value / middle - 1.0) < 0.3]
         if len(alike) > max(1, len(own) // 2):
             scale = np.diag([1.0 / middle if joint in alike else 1.0 for joint in range(data.chain.n)])
             yield Explanation(
-                f"{side} torque", tuple(alike), unit_of(middle), _mapped(data, side, scale), 0.0, middle,
+                f"{side} torque", tuple(alike), unit_of(middle), data.mapped(side, scale), 0.0, middle,
                 wrong[alike[0]],
             )  # fmt: skip
 
@@ -167,10 +216,6 @@ def _exchange(data: Redundancy, a: int, b: int) -> Floats:
     order = np.arange(data.chain.n)
     order[[a, b]] = b, a
     return np.eye(data.chain.n)[order]
-
-
-def _mapped(data: Redundancy, side: str, matrix: Floats) -> Redundancy:
-    return replace(data, maps={**data.maps, side: matrix @ data.map_of(side)})
 
 
 def moved(data: Redundancy, matrix: Floats, offset: Floats | float = 0.0) -> Redundancy:

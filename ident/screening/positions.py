@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import null_space
 
 from ident.dynamics.parameters import Floats
 from ident.screening.redundancy import Fit, Normal, Redundancy, SampledRows
@@ -61,7 +62,7 @@ class PositionError:
 
 
 def position_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PositionError]:
-    """The error that explains most, if there is one that explains enough."""
+    """The error that explains most, if there is one that explains enough, and more than a base that leans."""
     found = []
     before = [data.rigid(rows, fit) for rows in data.rows]
     # In motor torques alone, friction that follows no simple law looks like late positions.
@@ -80,7 +81,7 @@ def position_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[Position
         ]
 
     sizes = data.along(fit, normal, (columns(*one) for one in asked))
-    for (joint, kind), (size, std) in zip(asked, sizes, strict=True):
+    for (joint, kind), (size, std, _) in zip(asked, sizes, strict=True):
         # Beyond one the column says nothing.
         if not max(KINDS[kind].least, _DEVIATIONS * std) < abs(size) < 1.0:
             continue
@@ -89,7 +90,24 @@ def position_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[Position
         if drop > KINDS[kind].drop:
             recorded = {"offset": -size, "gain": 1.0 / (1.0 + size) - 1.0}.get(kind, size)
             found.append(PositionError(joint, kind, recorded, std, drop))
-    return sorted(found, key=lambda one: -one.drop)[:1]
+    best = max(found, key=lambda one: one.drop, default=None)
+    return [] if best is None or best.drop <= _leaning(data, fit, normal) else [best]
+
+
+def _leaning(data: Redundancy, fit: Fit, normal: Normal) -> float:
+    """Fall of the score with the base leaning as it explains most."""
+    gravity = np.asarray(data.chain.gravity, dtype=np.float64)
+    size = float(np.linalg.norm(gravity))
+    if not size:
+        return 0.0
+    sideways = size * null_space(gravity[None]).T
+    still = [replace(rows, qd=0.0 * rows.qd, qdd=0.0 * rows.qdd) for rows in data.rows]
+    turned = [replace(data, chain=replace(data.chain, gravity=one)) for one in sideways]
+    columns = ([one.rigid(rows, fit) for rows in still] for one in turned)
+    tilt = [found.value for found in data.along(fit, normal, columns)]
+    leaning = gravity + tilt @ sideways
+    leaning *= size / np.linalg.norm(leaning)
+    return fit.score - replace(data, chain=replace(data.chain, gravity=leaning)).fit(doubtful=False).score
 
 
 def changed(rows: SampledRows, joint: int, kind: str, size: float) -> SampledRows:

@@ -6,18 +6,20 @@ channel contradicts the others. `Redundancy` keeps the normal equations of each 
 
     G_c = W_c^T W_c,   B_c = W_c^T Y,   T_c = covariance of Y,
 
-with the torques Y of all joints of the side. A changed torque channel (gain, sign, interchanged joints) is then a
-linear map of Y and needs no new rows. The fit reweights each class by its own residual, so that a wrong channel
-does not bend the others: it stands out by its residual. The statistic of a class is rho, its residual over its
-torque; the sum of log rho over the classes ranks explanations.
+with the torques Y of all joints of the side and a column of ones. A changed torque channel (gain, sign, zero,
+interchanged joints) is then a linear map of Y and needs no new rows. B_c and T_c are kept by part, half a session each,
+because a channel may be wrong in one session or from some moment on. The fit reweights each class by its own residual,
+so that a wrong channel does not bend the others: it stands out by its residual. The statistic of a class is rho, its
+residual over its torque; the sum of log rho over the classes ranks explanations.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dpotrs, dpstrf
@@ -34,6 +36,7 @@ from ident.rows.sessions import payload_name
 from lwr_driver.session import Session
 
 Class = tuple[str, int]
+Part = tuple[int, int]
 
 _BODY = len(INERTIAL)
 # Friction of the joint side; drive inertia, friction and offset of the motor side.
@@ -59,6 +62,7 @@ class SampledRows:
     """Filtered motion and torque of one side of one session at the times of its rows.
 
     q, qd, qdd, sign, torque, slope : (K, n); sign is the filtered sign(qd), slope the time derivative of the torque.
+    half : 0 or 1, of the session.
     """
 
     side: str
@@ -71,6 +75,12 @@ class SampledRows:
     coupled: Floats
     torque: Floats
     slope: Floats
+    half: int = 0
+
+    @property
+    def part(self) -> Part:
+        """Session and half."""
+        return self.record, self.half
 
     def moved(self, q: Floats, speed: Floats) -> SampledRows:
         """The rows with positions Q = q A + offset already in `q`, and speeds times the matrix `speed` (n, n)."""
@@ -82,7 +92,15 @@ class SampledRows:
 
     def thinned(self, step: int) -> SampledRows:
         """Every `step`-th row."""
-        return replace(self, **{name: getattr(self, name)[::step] for name in _ARRAYS})
+        return self._cut(slice(None, None, step))
+
+    def halved(self, row: int) -> tuple[SampledRows, ...]:
+        """The rows before `row` as the first half of the session, and those from it on as the second."""
+        first, second = self._cut(slice(0, max(row, 0))), self._cut(slice(max(row, 0), None))
+        return tuple(one for one in (first, replace(second, half=1)) if len(one.q))
+
+    def _cut(self, at: slice) -> SampledRows:
+        return replace(self, **{name: getattr(self, name)[at] for name in _ARRAYS})
 
 
 def sampled(
@@ -147,12 +165,14 @@ def _rows(
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations of the m classes.
+    """Normal equations of the m classes, the torques' of the o parts.
 
-    matrix : G (m, p, p). mixed : B (m, p, n). scatter, square : T (m, n, n) without and S with the mean.
+    matrix : G (m, p, p). mixed : B (m, o, p, n + 1). scatter, square : T (m, o, n + 1, n + 1) without the mean of the
+    session, and S with it.
     """
 
     classes: tuple[Class, ...]
+    parts: tuple[Part, ...]
     matrix: Floats
     mixed: Floats
     scatter: Floats
@@ -189,12 +209,22 @@ class Gain:
     left: float
 
 
+class Size(NamedTuple):
+    """Size of an error beside all parameters, its standard deviation, and the share (rms) of the residual that is left
+    in the rows with it."""
+
+    value: float
+    std: float
+    left: float
+
+
 @dataclass(frozen=True)
 class Redundancy:
     """The rows of an arm and the classes in use.
 
     rows : all sides and sessions. silent : classes left out (dead sensors). couplings : pairs of joints.
-    maps : (n, n) by side, true torque = map @ measured torque.
+    maps : (n + 1, n + 1) by side, [true torque, 1] = map @ [measured torque, 1]. own : the same by side and part,
+    after them.
     """
 
     chain: Chain
@@ -202,6 +232,7 @@ class Redundancy:
     silent: frozenset[Class] = frozenset()
     couplings: tuple[tuple[int, int], ...] = ()
     maps: Mapping[str, Floats] = field(default_factory=dict)
+    own: Mapping[tuple[str, Part], Floats] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -219,7 +250,7 @@ class Redundancy:
         rows = sampled(sessions, signals, pairs, recall)
         count = max((sum(len(r.q) for r in rows if r.side == side) for side in ("joint", "motor")), default=0)
         step = max(1, -(-count // _MOST_ROWS))
-        return cls(chain, tuple(r.thinned(step) for r in rows), silent, pairs)
+        return cls(chain, tuple(_halves([r.thinned(step) for r in rows])), silent, pairs)
 
     @cached_property
     def sides(self) -> tuple[str, ...]:
@@ -281,11 +312,15 @@ class Redundancy:
         n = self.chain.n
         classes = [(side, j) for side in self.sides for j in range(n)]
         place = {key: k for k, key in enumerate(key for key in classes if key not in self.silent)}
-        width = self.width
-        matrix, mixed = np.zeros((len(place), width, width)), np.zeros((len(place), width, n))
-        scatter, square = np.zeros((2, len(place), n, n))
+        width, parts = self.width, tuple(sorted({rows.part for rows in self.rows}))
+        matrix = np.zeros((len(place), width, width))
+        mixed = np.zeros((len(place), len(parts), width, n + 1))
+        scatter, square = np.zeros((2, len(place), len(parts), n + 1, n + 1))
+        means = self._means()
         for rows in self.rows:
-            centred = rows.torque - rows.torque.mean(axis=0)
+            torque, o = _with_one(rows.torque), parts.index(rows.part)
+            centred = torque - np.append(means[rows.side, rows.record], 1.0)
+            products = centred.T @ centred, torque.T @ torque
             for j, own in enumerate(self.matrix(rows)):
                 if (k := place.get((rows.side, j))) is None:
                     continue
@@ -293,19 +328,43 @@ class Redundancy:
                 used = np.flatnonzero(own.any(axis=0))
                 part = own[:, used]
                 matrix[k][np.ix_(used, used)] += part.T @ part
-                mixed[k, used] += part.T @ rows.torque
-                scatter[k] += centred.T @ centred
-                square[k] += rows.torque.T @ rows.torque
-        return Normal(tuple(place), matrix, mixed, scatter, square)
+                mixed[k, o, used] += part.T @ torque
+                scatter[k, o] += products[0]
+                square[k, o] += products[1]
+        return Normal(tuple(place), parts, matrix, mixed, scatter, square)
+
+    def _means(self) -> dict[tuple[str, int], Floats]:
+        """Mean torque (n,) of each side of each session."""
+        torques: dict[tuple[str, int], list[Floats]] = {}
+        for rows in self.rows:
+            torques.setdefault((rows.side, rows.record), []).append(rows.torque)
+        return {key: np.concatenate(values).mean(axis=0) for key, values in torques.items()}
 
     def enough(self, share: float) -> bool:
         """Whether there are `share` rows for each parameter."""
         count = sum(len(rows.q) for rows in self.rows) * self.chain.n - len(self.silent)
         return count >= share * self.width
 
-    def map_of(self, side: str) -> Floats:
-        """(n, n), true torque = map @ measured torque."""
-        return self.maps.get(side, np.eye(self.chain.n))
+    def map_of(self, side: str, part: Part | None = None) -> Floats:
+        """(n + 1, n + 1), [true torque, 1] = map @ [measured torque, 1]; of a side, or of a part's."""
+        whole = self.maps.get(side, np.eye(self.chain.n + 1))
+        return whole if part is None or (side, part) not in self.own else self.own[side, part] @ whole
+
+    def mapped(
+        self, side: str, matrix: Floats, shift: Floats | float = 0.0, parts: Sequence[Part] = ()
+    ) -> Redundancy:
+        """The data with true torque = `matrix` (n, n) @ torque + `shift` (n,) [Nm] on a side, or some of its parts."""
+        change = np.eye(self.chain.n + 1)
+        change[:-1, :-1], change[:-1, -1] = matrix, shift
+        if not parts:
+            return replace(self, maps={**self.maps, side: change @ self.map_of(side)})
+        unchanged = np.eye(self.chain.n + 1)
+        own = {(side, part): change @ self.own.get((side, part), unchanged) for part in parts}
+        return replace(self, own={**self.own, **own})
+
+    def true_torque(self, rows: SampledRows) -> Floats:
+        """Torque (K, n) with the changes of the channel undone."""
+        return np.asarray(_with_one(rows.torque) @ self.map_of(rows.side, rows.part)[:-1].T)
 
     def fit(self, normal: Normal | None = None, *, doubtful: bool = True) -> Fit:
         """Weighted least squares, each class weighted by its own residual.
@@ -313,11 +372,11 @@ class Redundancy:
         normal : of rows with different `maps` only. doubtful : whether a torque may be in a wrong unit.
         """
         normal = self.normal() if normal is None else normal
-        chosen = np.array([self.map_of(side)[joint] for side, joint in normal.classes])
-        chosen = chosen.reshape(-1, self.chain.n)
-        mixed = np.einsum("kpn,kn->kp", normal.mixed, chosen)
+        maps = [[self.map_of(side, part)[joint] for part in normal.parts] for side, joint in normal.classes]
+        chosen = np.array(maps).reshape(-1, len(normal.parts), self.chain.n + 1)
+        mixed = np.einsum("kopn,kon->kp", normal.mixed, chosen)
         scatter, square = (
-            np.einsum("kn,knm,km->k", chosen, part, chosen) for part in (normal.scatter, normal.square)
+            np.einsum("kon,konm,kom->k", chosen, part, chosen) for part in (normal.scatter, normal.square)
         )
         total = np.maximum(scatter, 1e-12 * np.maximum(square, 1e-12))
         common = np.full_like(total, np.max(total, initial=0.0) or 1.0)
@@ -329,7 +388,7 @@ class Redundancy:
         for start in (total, common)[: 1 + doubtful]:
             weight, error, values = 1.0 / start, total, np.zeros(0)
             for _ in range(_ROUNDS):
-                values = _solve((weight @ flat.reshape(count, -1)).reshape(width, width), weight @ mixed)
+                values = solve((weight @ flat.reshape(count, -1)).reshape(width, width), weight @ mixed)
                 fitted = (flat @ values).reshape(count, width) @ values
                 error = np.maximum(square - 2.0 * mixed @ values + fitted, 0.0)
                 weight = 1.0 / np.maximum(error, least)
@@ -346,78 +405,70 @@ class Redundancy:
     def gains(self, fit: Fit, normal: Normal) -> dict[Class, Gain]:
         """Gain of each class against its torque computed from the shared parameters.
 
-        The computed torque z of the class is an added column; its projection on the others is taken off, so the
-        gain comes from the other joints, the other side and other poses. Standard deviation by blocks of rows.
+        The computed torque of the class is an added column, so the gain comes from the other joints, the other side and
+        other poses.
         """
-        shared = np.zeros_like(fit.parameters)
-        shared[: _BODY * (self.chain.n + len(self.payloads))] = 1.0
-        total = normal.total(fit.weight)
-        matrices = [self.matrix(rows) for rows in self.rows]
-        result = {}
-        part = shared * fit.parameters
-        for key, own in zip(normal.classes, normal.matrix, strict=True):
-            others = _solve(total, fit.weight[key] * (own @ part))
-            den = num = spread = before = after = 0.0
-            scores: list[tuple[Floats, Floats, float]] = []
-            for rows, matrix in zip(self.rows, matrices, strict=True):
-                measured = rows.torque @ self.map_of(rows.side).T
-                for j, own_rows in enumerate(matrix):
-                    place = (rows.side, j)
-                    if place not in fit.weight:
-                        continue
-                    column = (own_rows @ part if place == key else 0.0) - own_rows @ others
-                    error = measured[:, j] - own_rows @ fit.parameters
-                    scores.append((np.asarray(column), error, fit.weight[place]))
-                    den += fit.weight[place] * float(column @ column)
-                    num += fit.weight[place] * float(column @ error)
-            delta = num / max(den, 1e-300)
-            for column, error, weight in scores:
-                product = weight * column * (error - delta * column)
-                spread += float(np.sum(np.add.reduceat(product, np.arange(0, len(product), _BLOCK)) ** 2))
-            for rows, matrix in zip(self.rows, matrices, strict=True):
-                if rows.side == key[0]:
-                    own_rows = matrix[key[1]]
-                    error = (rows.torque @ self.map_of(rows.side).T)[:, key[1]] - own_rows @ fit.parameters
-                    column = own_rows @ (part - others)
-                    before += float(error @ error)
-                    after += float((error - delta * column) @ (error - delta * column))
-            result[key] = Gain(
-                1.0 + delta, np.sqrt(spread) / max(den, 1e-300), float(np.sqrt(after / max(before, 1e-300)))
-            )
-        return result
+        computed = [self.shared_torque(rows, fit) for rows in self.rows]
+        columns = (
+            [
+                _only(values, key[1] if rows.side == key[0] else None)
+                for rows, values in zip(self.rows, computed, strict=True)
+            ]
+            for key in normal.classes
+        )
+        sizes = self.along(fit, normal, columns)
+        return {
+            key: Gain(1.0 + size.value, size.std, size.left)
+            for key, size in zip(normal.classes, sizes, strict=True)
+        }
 
-    def along(
-        self, fit: Fit, normal: Normal, errors: Iterable[Sequence[Floats]]
-    ) -> Iterator[tuple[float, float]]:
-        """Size of each error beside all parameters, and its standard deviation by blocks of rows.
+    def shared_torque(self, rows: SampledRows, fit: Fit) -> Floats:
+        """Torque (n, K) [Nm] of the parameters that the joints share."""
+        shared = np.zeros_like(fit.parameters)
+        last = _BODY * (self.chain.n + len(self.payloads))
+        shared[:last] = fit.parameters[:last]
+        return np.asarray(self.matrix(rows) @ shared)
+
+    def along(self, fit: Fit, normal: Normal, errors: Iterable[Sequence[Floats]]) -> Iterator[Size]:
+        """Size of each error beside all parameters, with its standard deviation by blocks of rows.
 
         errors : of each the columns (n, K) for all sets of rows, what an error by one adds to the computed torques
-            [Nm].
+            [Nm]. Their projection on the parameters is taken off.
         """
         total = normal.total(fit.weight)
         table = []
         for rows in self.rows:
             matrix = self.matrix(rows)
             weight = np.array([fit.weight.get((rows.side, j), 0.0) for j in range(self.chain.n)])
-            left = self.map_of(rows.side) @ rows.torque.T - matrix @ fit.parameters
+            left = self.true_torque(rows).T - matrix @ fit.parameters
             table.append((matrix, weight, left))
         for columns in errors:
             shared = np.zeros_like(fit.parameters)
             for (matrix, weight, _), column in zip(table, columns, strict=True):
-                shared += sum(w * (c @ own) for own, c, w in zip(matrix, column, weight, strict=True))
-            others = _solve(total, shared)
-            rests = [column - matrix @ others for (matrix, *_), column in zip(table, columns, strict=True)]
+                for own, c, w in zip(matrix, column, weight, strict=True):
+                    if w and c.any():
+                        shared += w * (c @ own)
+            others = solve(total, shared)
             parts = [
-                (rest, weight[:, None] * rest, left)
-                for rest, (_, weight, left) in zip(rests, table, strict=True)
+                (column, column - matrix @ others, weight[:, None], left)
+                for (matrix, weight, left), column in zip(table, columns, strict=True)
             ]
-            den = max(sum(float(np.sum(weighted * rest)) for rest, weighted, _ in parts), 1e-300)
-            size = sum(float(np.sum(weighted * left)) for _, weighted, left in parts) / den
-            spread = 0.0
-            for rest, weighted, left in parts:
-                product = np.sum(weighted * (left - size * rest), axis=0)
-                spread += float(np.sum(np.add.reduceat(product, np.arange(0, len(product), _BLOCK)) ** 2))
-            yield size, float(np.sqrt(spread)) / den
+            den = max(sum(float(np.sum(weight * rest**2)) for _, rest, weight, _ in parts), 1e-300)
+            size = sum(float(np.sum(weight * rest * left)) for _, rest, weight, left in parts) / den
+            before = after = 0.0
+            # Errors of the joints at a time may agree or cancel: by chance, not by law.
+            together = apart = 0.0
+            for column, rest, weight, left in parts:
+                error = left - size * rest
+                product = weight * rest * error
+                blocks = np.add.reduceat(product, np.arange(0, product.shape[1], _BLOCK), axis=1)
+                together += float(np.sum(blocks.sum(axis=0) ** 2))
+                apart += float(np.sum(blocks**2))
+                acting = weight * (column != 0.0)
+                before += float(np.sum(acting * left**2))
+                after += float(np.sum(acting * error**2))
+            left_over = float(np.sqrt(after / before)) if before > 0.0 else 1.0
+            yield Size(size, float(np.sqrt(max(together, apart))) / den, left_over)
 
     def rigid(self, rows: SampledRows, fit: Fit) -> Floats:
         """Torque (n, K) [Nm] of the bodies of a fit."""
@@ -431,10 +482,10 @@ class Redundancy:
     def deviation(self, fit: Fit, normal: Normal, directions: Floats) -> Floats:
         """Standard deviation (m,) of the combinations `directions` (m, p) of the parameters, by blocks of rows."""
         total = normal.total(fit.weight)
-        spreads = np.column_stack([_solve(total, direction) for direction in directions])
+        spreads = np.column_stack([solve(total, direction) for direction in directions])
         variance = np.zeros(len(directions))
         for rows in self.rows:
-            measured = rows.torque @ self.map_of(rows.side).T
+            measured = self.true_torque(rows)
             for j, own in enumerate(self.matrix(rows)):
                 if (rows.side, j) in fit.weight:
                     error = measured[:, j] - own @ fit.parameters
@@ -444,7 +495,31 @@ class Redundancy:
         return np.sqrt(variance)
 
 
-def _solve(matrix: Floats, right: Floats) -> Floats:
+def _halves(rows: Sequence[SampledRows]) -> Iterator[SampledRows]:
+    """The rows by half of their session, by the number of rows of a side."""
+    count, seen = Counter[tuple[str, int]](), Counter[tuple[str, int]]()
+    for one in rows:
+        count[one.side, one.record] += len(one.q)
+    for one in rows:
+        key = one.side, one.record
+        yield from one.halved(count[key] // 2 - seen[key])
+        seen[key] += len(one.q)
+
+
+def _with_one(torque: Floats) -> Floats:
+    """The torques (K, n) and a column of ones."""
+    return np.column_stack([torque, np.ones(len(torque))])
+
+
+def _only(values: Floats, joint: int | None) -> Floats:
+    """The rows (n, K) of one joint, or of none; zero in the others."""
+    out = np.zeros_like(values)
+    if joint is not None:
+        out[joint] = values[joint]
+    return out
+
+
+def solve(matrix: Floats, right: Floats) -> Floats:
     """Solution of the normal equations in the excited columns (Cholesky with pivots), zero in the others."""
     scale = np.sqrt(np.diag(matrix))
     scale = np.where(scale > max(_NOTHING * np.max(scale, initial=0.0), 1e-150), scale, np.inf)

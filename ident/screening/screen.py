@@ -30,6 +30,7 @@ from ident.rows.sessions import payload_name
 from ident.screening.channels import check_channels, check_limits, dead
 from ident.screening.doubts import Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, explain, is_wrong, unit_of
+from ident.screening.parts import part_errors
 from ident.screening.positions import position_errors
 from ident.screening.redundancy import Class, Fit, Normal, Redundancy
 from lwr_driver.session import Session, Sessions, as_sessions
@@ -41,12 +42,16 @@ logger = logging.getLogger(__name__)
 _DOUBT, _CERTAIN = float(np.log(10.0)), float(np.log(100.0))
 # Gains beyond a factor of two, and reversed signs, are no calibration; undone, they leave this share of the residual.
 _FACTOR, _LEFT = 2.0, 0.6
+# An error in a part of the data: the product of the residuals falls to two thirds.
+_PART = float(np.log(1.5))
 # A payload acts on all joints: the geometric mean of the residuals falls to a half.
 _LABEL = float(np.log(2.0))
 # Rows for each parameter, below which a fit explains anything.
 _ROWS = 3.0
-# Row rates tried, over that of the settings.
-_RATES = (1.0, 2.5)
+# Pass bands tried, over that of the settings: rows see the motion low-passed, and fast motion contradicts itself in a
+# narrow band. Below this residual over torque of all joints no wider one is tried.
+_BANDS = (1.0, 2.5)
+_IN_BAND = 0.05
 _POSES = 64
 # Factor between an arm's gravity and its URDF's: 0.9 to 1.4 in six real arms. Correlation of gravity of the two, and
 # number of joints, to speak of a factor.
@@ -113,18 +118,29 @@ def _rows(
     couplings: Sequence[Coupling],
     recall: Recall,
 ) -> Redundancy | None:
-    """Rows of the sessions, at a higher rate for short ones; None for too few rows for a contradiction."""
-    for factor in _RATES:
-        faster = replace(signals, decimate_hz=min(factor * signals.decimate, 0.5 * signals.cutoff))
+    """Rows of the sessions, in a wider band where the joints agree clearly better; None for too few rows."""
+    best, least = None, np.inf
+    for factor in _BANDS:
+        wider = replace(
+            signals,
+            cutoff_hz=factor * signals.cutoff,
+            decimate_hz=factor * signals.decimate,
+            edge_s=signals.edge,
+        )
         try:
-            data = Redundancy.of(sessions, chain, faster, couplings, _silent(sessions), recall)
+            data = Redundancy.of(sessions, chain, wider, couplings, _silent(sessions), recall)
         except LwrError as error:
             # The fit itself says what is too short or does not move.
-            logger.info("no screening by redundancy at %g Hz: %s", faster.decimate_hz, error)
+            logger.info("no screening by redundancy at %g Hz: %s", wider.decimate_hz, error)
             continue
-        if data.rows and data.enough(_ROWS):
-            return data
-    return None
+        if not (data.rows and data.enough(_ROWS)):
+            continue
+        fit = data.fit()
+        if fit.score < least - _DOUBT:
+            best, least = data, fit.score
+        if max(fit.rho.values(), default=0.0) < _IN_BAND:
+            break
+    return best
 
 
 def without_dead(problem: Problem, session: Session) -> Problem:
@@ -171,7 +187,8 @@ def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> list[Doubt
     normal = data.normal()
     fit = data.fit(normal)
     found: list[Doubt] = []
-    if max(fit.rho.values()) > AGREES or any(map(is_wrong, data.gains(fit, normal).values())):
+    wrong = max(fit.rho.values()) > AGREES or any(map(is_wrong, data.gains(fit, normal).values()))
+    if wrong or part_errors(data, fit, normal):
         explanations, data = explain(data, _supported)
         explanations = [_of_the_wrong_side(one) for one in explanations]
         data = explanations[-1].mended if explanations else data
@@ -206,7 +223,9 @@ def _of_the_wrong_side(one: Explanation) -> Explanation:
     if one.gain is None or len(one.joints) < 2 or len(data.sides) < 2:
         return one
     scale = np.diag([one.factor if joint in one.joints else 1.0 for joint in range(data.chain.n)])
-    turned = replace(data, maps={side: scale @ data.map_of(side) for side in data.sides})
+    turned = data
+    for side in data.sides:
+        turned = turned.mapped(side, scale)
     inertias = [_inertia(d.chain, _poses(d), _bodies(d, d.fit())) for d in (data, turned)]
     if one.factor < 0.0:
         other = bool(np.sum(inertias[1] > 0.0) > np.sum(inertias[0] > 0.0))
@@ -227,6 +246,8 @@ def _supported(one: Explanation, classes: int) -> bool:
     """Whether an explanation gains enough to be believed."""
     if one.gain is not None:
         return one.drop > 0.0
+    if one.error is not None:
+        return one.drop > _PART
     return one.drop > (_LABEL * classes if one.channel == "payload" else _DOUBT)
 
 
@@ -245,6 +266,9 @@ def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
         strange = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
         certain = strange and one.gain.left < _LEFT
         mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
+    elif one.parts:
+        session, seen, certain = _of_part(one, sessions)
+        mend = "check this channel there; the mapping of its import mends a known factor (`scale`) or order of columns"
     elif channel == "payload":
         session = sessions[int(one.label)].path.name
         stated = payload_name(sessions[int(one.label)]) or "none"
@@ -263,6 +287,24 @@ def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
         seen = f"contradicts the other channels; {better}"
         mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
     return Doubt(channel, joints, seen, one.looks_like, mend, certain, session)
+
+
+def _of_part(one: Explanation, sessions: Sequence[Session]) -> tuple[str, str, bool]:
+    """Session with its half, what was seen, and whether the data are worthless with it, for an error of some parts."""
+    record, half = one.parts[0]
+    session = sessions[record].path.name
+    if len(one.parts) == 1:
+        session += f", {('first', 'second')[half]} half"
+    rest = "the torque computed from all other channels and the rest of the data"
+    if one.error is None:
+        seen = f"contradicts {rest}" if len(one.joints) > 1 else f"is about {one.factor:g} times {rest}"
+        return session, seen, len(one.joints) == 1 or one.drop > _CERTAIN
+    value, std = one.error.value, one.error.std
+    if one.error.kind == "zero":
+        more = "higher" if value > 0.0 else "lower"
+        return session, f"is {abs(value):.3g} ± {std:.2g} Nm {more} than {rest}", False
+    gross = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
+    return session, f"is {value:.4g} ± {std:.2g} times {rest}", gross and one.error.left < _LEFT
 
 
 def _poses(data: Redundancy) -> Floats:

@@ -11,11 +11,14 @@ import pytest
 from benchmarks.wrong_channels import (
     clipped,
     constant,
+    from_the_middle,
     frozen,
+    in_one,
     labelled,
     mistaken,
     paced,
     scaled,
+    shifted,
     swapped,
     with_speed,
     without,
@@ -78,6 +81,32 @@ def test_a_wrong_channel_is_an_error_with_its_name(pair, change, channel, joints
     found = [doubt for doubt in doubts(change(pair)) if doubt.certain]
     assert (found[0].channel, found[0].joints) == (channel, joints)
     assert words in str(found[0])
+
+
+M, L = ("motor", "effort"), ("joint", "effort")
+
+
+@pytest.mark.parametrize(
+    ("change", "side", "joints", "words", "certain", "where"),
+    [
+        (in_one(scaled(*M, -1.0, "A2"), 1), "motor", ("A2",), "reversed sign", True, 1),
+        (in_one(scaled(*L, 1e-3, "A3")), "joint", ("A3",), "kNm", True, 0),
+        (in_one(scaled(*L, 1.4, "A4"), 1), "joint", ("A4",), "a gain of 1.39", False, 1),
+        (in_one(swapped(*M, "A3", "A4"), 1), "motor", ("A3", "A4"), "interchanged", True, 1),
+        (in_one(shifted(*L, 20.0, "A2")), "joint", ("A2",), "another zero", False, None),
+        (from_the_middle(*M, scaled(*M, -1.0, "A4")), "motor", ("A4",), "second half", True, 0),
+        (from_the_middle(*L, scaled(*L, 0.7, "A2")), "joint", ("A2",), "second half", False, 0),
+    ],
+)
+def test_a_torque_wrong_in_a_part_of_the_data_is_named_with_it(  # type: ignore[no-untyped-def]
+    pair, change, side, joints, words, certain, where
+) -> None:
+    (found,) = doubts(change(pair))
+    assert (found.channel, found.joints, found.certain) == (f"{side} torque", joints, certain)
+    assert words in str(found)
+    # Which of two sessions has the right zero cannot be told.
+    if where is not None:
+        assert found.session.startswith(pair[where].path.name)
 
 
 @pytest.mark.parametrize("side", ["motor", "joint"])
@@ -270,7 +299,7 @@ def test_a_channel_frozen_in_the_middle_of_a_motion_is_named(
 ) -> None:
     for commanded in (True, False):
         logs = pair if commanded else [replace(session, command=None) for session in pair]
-        (found,) = check_channels(frozen(channel, field, "A3", only=1)(logs), chain())
+        (found,) = check_channels(in_one(frozen(channel, field, "A3"), 1)(logs), chain())
         assert (found.channel, found.joints, found.session, found.certain) == (
             name,
             ("A3",),
@@ -449,7 +478,7 @@ def test_rows_of_a_sensor_dead_in_one_session_are_left_out(pair: list[Session]) 
     from ident.rows.observation import observe
     from ident.rows.prepare import prepare
 
-    bad = constant("joint", "effort", 0.0, "A4", only=0)(pair)
+    bad = in_one(constant("joint", "effort", 0.0, "A4"))(pair)
     (found,) = screen(bad, chain())
     assert not found.certain
     rows = observe([prepare(bad[0])], [None], ModelStructure(chain()))
