@@ -68,6 +68,26 @@ class SessionRows:
             problem=replace(self.problem, nuisances=nuisances),
         )
 
+    def doubted(self) -> SessionRows:
+        """The same with warnings of a delay that no channel has, and of joints with a delay of their own."""
+        delay, said = self.delay, []
+        if delay is None:
+            return self
+        if delay.early:
+            said.append(
+                f"{self.prepared.name}: the {self.side} torques fit the motion best {-1e3 * delay.estimate:.1f} ms "
+                "early, as no channel can be: the positions are late, or the stamps are wrong. They are taken as "
+                f"not late; correct the stamps, or state `{self.side}_delay_s`"
+            )
+        for joint in delay.apart:
+            late, std = delay.by_joint[joint]
+            said.append(
+                f"{self.prepared.name}: {joint} {self.side} torque fits the motion best "
+                f"{1e3 * late:.1f} ± {1e3 * std:.1g} ms late, against {1e3 * delay.estimate:.1f} ms of the other "
+                "joints; check how this channel is recorded"
+            )
+        return replace(self, prepared=replace(self.prepared, warnings=(*self.prepared.warnings, *said)))
+
 
 def session_rows(
     session: Session,
@@ -129,7 +149,7 @@ def with_delays(
         some = untold[first : first + _TOGETHER]
         told = _told([made[k] for k in some], [partial(at, k) for k in some])
         for k, rows in zip(some, told, strict=True):
-            found[k] = rows
+            found[k] = rows.doubted()
             logger.info("%s: %s torques %s", rows.prepared.name, rows.side, rows.delay)
     return found
 

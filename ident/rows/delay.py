@@ -67,6 +67,10 @@ DISAGREEMENT = 3.0
 that are a third too small."""
 # Least delay of joint torques, or of joints that disagree, over the scatter of the joints: each shows it by itself.
 _ALIKE = 3.0
+# Standard deviations within which a joint agrees with the weighted median, and beyond which, and by how much [s], it
+# is late by itself.
+_AGREES = 3.0
+_APART, _APART_S = 20.0, 5e-3
 # A delay within this many standard deviations of zero is not told apart from zero.
 _DISTINCT = 1.96
 # Latest estimates: an estimator prepares a session several times.
@@ -81,7 +85,8 @@ class Delay:
         with the uncertainty of a delay that is set to zero. how : origin. estimate : the unrestricted estimate [s].
     by_joint : delay of each moving joint by itself, and its standard deviation, with that of its compliance [s].
     disagreement : scatter of the joints over their standard deviations; `std` already includes this factor.
-    earliest : least delay [s]: zero, or -inf where the positions are late.
+    earliest : least delay [s]: zero, or -inf where the positions are late. apart : joints clearly late by themselves,
+        or early, against those that agree.
     """
 
     seconds: float
@@ -91,6 +96,7 @@ class Delay:
     by_joint: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     disagreement: float = 1.0
     earliest: float = 0.0
+    apart: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -271,18 +277,32 @@ def delays_from_model(
         if not mine:
             raise DataError(f"no {side} torque of {problem.record_names[record]} changes with its delay")
         own = list(mine.values())
-        earliest = -np.inf if side == "joint" else 0.0
-        delay = _together(
-            list(mine), before[record] + fit.values[own], fit.std[own], "from the base model", earliest
-        )
-        disagree = delay.disagreement > DISAGREEMENT
-        if abs(delay.estimate) < _ALIKE * delay.std * len(own) ** 0.5 and (disagree or side == "joint"):
-            # What the base model lacks looks late, too, in each joint by another time.
-            std = 0.0 if disagree else float(np.hypot(delay.std, delay.seconds))
-            how = "the joints disagree" if disagree else delay.how
-            delay = replace(delay, seconds=0.0, std=std, how=how)
-        found[record] = delay
+        found[record] = _agreed(list(mine), before[record] + fit.values[own], fit.std[own], side)
     return found
+
+
+def _agreed(names: Sequence[str], values: Floats, stds: Floats, side: str) -> Delay:
+    """The delay of the joints that agree. What the base model lacks looks late, too, in each joint by another time."""
+    order = np.argsort(values)
+    weights = np.cumsum(stds[order] ** -2.0)
+    middle = values[order[np.searchsorted(weights, 0.5 * weights[-1])]]
+    agree = np.abs(values - middle) <= _AGREES * stds
+    several = 2 * np.count_nonzero(agree) >= len(names)
+    chosen = np.flatnonzero(agree | (not several)).tolist()
+    earliest = -np.inf if side == "joint" else 0.0
+    delay = _together(
+        [names[j] for j in chosen], values[chosen], stds[chosen], "from the base model", earliest
+    )
+    by_joint = {name: (float(v), float(s)) for name, v, s in zip(names, values, stds, strict=True)}
+    beyond = np.abs(values - delay.estimate)
+    apart = several & (beyond > _APART * np.hypot(stds, delay.std)) & (beyond > _APART_S)
+    delay = replace(delay, by_joint=by_joint, apart=tuple(names[j] for j in np.flatnonzero(apart).tolist()))
+    doubtful = not agree.all() or delay.disagreement > DISAGREEMENT
+    if not several:
+        delay = replace(delay, how="the joints disagree")
+    if (doubtful or side == "joint") and abs(delay.estimate) < _ALIKE * delay.std * len(chosen) ** 0.5:
+        delay = replace(delay, seconds=0.0, std=float(np.hypot(delay.std, delay.seconds)))
+    return delay
 
 
 def fits_better(after: Problem, before: Problem, sides: Mapping[int, str]) -> bool:

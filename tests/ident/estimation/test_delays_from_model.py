@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import importlib
 from dataclasses import replace
 
@@ -135,17 +136,42 @@ def test_delays_of_many_long_sessions_come_from_a_few_and_their_first_rows(
         assert one.joint_delay.seconds == pytest.approx(late_s, abs=max(4.0 * one.joint_delay.std, 2e-4))
 
 
-def test_joints_that_disagree_tell_no_delay() -> None:
+def _late_by_joint(own: dict[str, float]) -> Delay:
     found = identify([sensed(0.0, 1)], chain(), SETTINGS)
     groups = []
     for place, group in enumerate(found.problem.groups):
         slope = next(one.columns[place] for one in found.problem.nuisances if place in one.columns)
-        own = (0.004 if group.joint == "A1" else -0.004) if group.side == "joint" else 0.0
-        groups.append(replace(group, target=group.target - own * slope))
-    delay = delays_from_model(replace(found.problem, groups=tuple(groups)), {0: "joint"}, {0: 0.0})[0]
+        late = own[group.joint] if group.side == "joint" else 0.0
+        groups.append(replace(group, target=group.target - late * slope))
+    return delays_from_model(replace(found.problem, groups=tuple(groups)), {0: "joint"}, {0: 0.0})[0]
+
+
+def test_joints_that_disagree_tell_no_delay_and_how_much_that_may_be() -> None:
+    names = chain().joint_names
+    delay = _late_by_joint(dict(zip(names, np.linspace(-0.012, 0.012, 7).tolist(), strict=True)))
     assert delay.disagreement > 3.0
-    assert (delay.seconds, delay.std) == (0.0, 0.0)
-    assert str(delay) == "not late (the joints disagree)"
+    assert delay.seconds == 0.0
+    assert delay.std > abs(delay.estimate)
+    assert delay.how == "the joints disagree"
+
+
+def test_a_joint_late_by_itself_is_named_beside_the_delay_of_the_others() -> None:
+    own = dict.fromkeys(chain().joint_names, -0.004)
+    delay = _late_by_joint({**own, "A1": 0.004})
+    assert delay.apart == ("A1",)
+    assert delay.by_joint["A1"][0] == pytest.approx(0.004, abs=3e-4)
+    assert delay.seconds == pytest.approx(-0.004, abs=1e-4)
+
+
+def test_a_joint_late_by_itself_is_a_warning() -> None:
+    log = sensed(0.0, 1)
+    effort = log.joint.effort.copy()
+    effort[:, 2] = np.roll(effort[:, 2], round(0.02 / log.joint.period_s))
+    found = identify(replace(log, joint=replace(log.joint, effort=effort)), chain(), SETTINGS)
+    (told,) = [text for text in found.warnings if "of the other joints; check how this" in text]
+    late = re.search(r"E1 joint torque fits the motion best ([\d.]+) ± [\d.]+ ms late", told)
+    assert late is not None
+    assert float(late[1]) == pytest.approx(20.0, abs=0.5)
 
 
 def test_torques_of_an_arm_at_rest_have_no_delay_to_tell() -> None:
