@@ -297,11 +297,11 @@ def _agreed(names: Sequence[str], values: Floats, stds: Floats, side: str) -> De
     beyond = np.abs(values - delay.estimate)
     apart = several & (beyond > _APART * np.hypot(stds, delay.std)) & (beyond > _APART_S)
     delay = replace(delay, by_joint=by_joint, apart=tuple(names[j] for j in np.flatnonzero(apart).tolist()))
-    doubtful = not agree.all() or delay.disagreement > DISAGREEMENT
-    if not several:
-        delay = replace(delay, how="the joints disagree")
-    if (doubtful or side == "joint") and abs(delay.estimate) < _ALIKE * delay.std * len(chosen) ** 0.5:
-        delay = replace(delay, seconds=0.0, std=float(np.hypot(delay.std, delay.seconds)))
+    disagree = not agree.all() or delay.disagreement > DISAGREEMENT
+    if (disagree or side == "joint") and abs(delay.estimate) < _ALIKE * delay.std * len(chosen) ** 0.5:
+        # A scatter that is not one of a delay is no uncertainty of it: on a real arm it is ten times too large.
+        std = 0.0 if disagree else float(np.hypot(delay.std, delay.seconds))
+        delay = replace(delay, seconds=0.0, std=std, how="the joints disagree" if disagree else delay.how)
     return delay
 
 
