@@ -1,8 +1,8 @@
 """Recordings made elsewhere: text, NPZ and MATLAB files and ROS 2 bags to session logs.
 
 `LogMapping.load` reads the mapping file, `import_log` writes the session, `guess_mapping` guesses a mapping from names,
-`read_recording` reads session logs and bags alike. Nothing is filtered, resampled or repaired on the way: a value
-is converted (unit, sign, scale, gear, offset) and written, or the import stops with an error.
+`read_recording` reads session logs and bags alike. Nothing is filtered or resampled on the way: a value is converted
+(unit, sign, scale, gear, offset, turns of an angle that wraps) and written, or the import stops with an error.
 """
 
 from __future__ import annotations

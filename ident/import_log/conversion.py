@@ -19,6 +19,7 @@ from ident.import_log.periods import EPS, Periods, find_periods, marked_periods
 from ident.import_log.read_back import check_written
 from ident.import_log.recording import Recording
 from ident.import_log.tables import Floats
+from ident.import_log.turns import unwrapped
 from lwr_driver.configuration import find, yaml_text
 from lwr_driver.session import SessionWriter, session_metadata
 
@@ -33,6 +34,7 @@ class ImportReport:
 
     rows : samples written of each topic. rows_in_source : samples of the recording.
     period_s, shortest_s, longest_s : median, least and greatest time between samples of `/joint_states` [s].
+    unwrapped : angles that wrapped, and where.
     holes : intervals longer than 1.75 periods, probably with lost samples.
     repeated : samples equal to the one before in every value; they are kept.
     periods : of the excitation, marked in the session; None for a motion without.
@@ -51,6 +53,7 @@ class ImportReport:
     longest_s: float
     holes: int
     repeated: int
+    unwrapped: tuple[str, ...]
     periods: Periods | None
     notes: tuple[str, ...]
     conversions: tuple[str, ...]
@@ -71,6 +74,7 @@ class ImportReport:
             f"{self.longest_s * 1e3:.4g} ms, {jitter}",
             *(lost if self.holes else ()),
             *(again if self.repeated else ()),
+            *(f"  unwrapped {turned}" for turned in self.unwrapped),
             *((f"  periods   {self.periods}",) if self.periods is not None else ()),
             *(f"  note      {note}" for note in self.notes),
             *(f"  {line}" for line in self.conversions),
@@ -119,7 +123,7 @@ def import_log(
     base, tip = base or mapping.base, tip or mapping.tip
     described, notes = _described(mapping, urdf, base, tip, beside)
     recording = Recording(source, mapping.delimiter, mapping.header, notes=notes)
-    total, channels = _read(mapping, recording, rows)
+    total, channels, turned = _read(mapping, recording, rows)
     joint = channels["position"]
     digest = hashlib.sha256(
         repr((sorted(recording.digests.values()), rows, mapping.joints)).encode()
@@ -182,8 +186,9 @@ def import_log(
         longest_s=float(steps.max()),
         holes=int(np.count_nonzero(steps > 1.75 * np.median(steps))),
         repeated=_repeated(channels),
+        unwrapped=tuple(turned),
         periods=periods,
-        notes=(*recording.notes, *_strange_rate(float(np.median(steps)))),
+        notes=(*recording.notes, *_strange_rate(float(np.median(steps))), *_jumping(mapping, joint)),
         conversions=_conversions(mapping),
         digests=recording.digests,
     )
@@ -252,8 +257,8 @@ def _described(
 
 def _read(
     mapping: LogMapping, recording: Recording, rows: tuple[int, int] | None
-) -> tuple[int, dict[str, _Channel]]:
-    """Rows of the recording, and every channel converted to joint side and SI."""
+) -> tuple[int, dict[str, _Channel], list[str]]:
+    """Rows of the recording, every channel converted to joint side and SI, and sentences about unwrapped angles."""
     first = 0 if rows is None else rows[0]
     raws: dict[str, Floats] = {}
     clocks: dict[str, NDArray[np.int64]] = {}
@@ -279,7 +284,8 @@ def _read(
         recording.notes.append(
             f"the clock begins at {-early * 1e-9:.9g} s; all times moved by {early * 1e-9:.9g} s, to begin at 0"
         )
-    channels = {}
+    channels: dict[str, _Channel] = {}
+    turned: list[str] = []
     for name, signal in mapping.signals.items():
         origin = _origin_ns(mapping, _base(mapping, name))
         shift = max(early, 0) if origin is None else origin
@@ -291,10 +297,16 @@ def _read(
             )
         # The source's own clock, counted from the first sample if it begins below zero.
         published = times - (0 if origin is None else origin)
-        channels[name] = _Channel(
-            times, published - min(0, int(published[0])), _convert(mapping, name, signal, raws[name])
-        )
-    return total, channels
+        values, wraps = _convert(mapping, name, signal, raws[name])
+        for own, at in zip(mapping.joints, wraps, strict=True):
+            if len(at):
+                since = float(times[at[0]] - times[0]) * 1e-9
+                steps = f"{len(at)} steps" if len(at) > 1 else "1 step"
+                turned.append(
+                    f"{name} of {own}: {steps} of 360 deg in one sample taken back, first at {since:.4g} s"
+                )
+        channels[name] = _Channel(times, published - min(0, int(published[0])), values)
+    return total, channels, turned
 
 
 def _base(mapping: LogMapping, name: str) -> TimeBase:
@@ -310,6 +322,16 @@ def _repeated(channels: Mapping[str, _Channel]) -> int:
     """Samples equal to the one before in every value of `/joint_states`."""
     values = np.hstack([channels[name].values for name in _ONCE if name in channels])
     return int(np.count_nonzero((np.diff(values, axis=0) == 0.0).all(axis=1)))
+
+
+def _jumping(mapping: LogMapping, joint: _Channel) -> list[str]:
+    """Notes on positions that jump, as `identify` will tell them."""
+    from ident.rows.data_quality import jumps  # on use: their import is slow
+    from ident.screening.channels import jump_doubts
+
+    times = (joint.times - joint.times[0]) * 1e-9
+    lengths = [mapping.position.unit == "m"] * len(mapping.joints)
+    return [str(doubt) for doubt in jump_doubts(jumps(times, joint.values), times, mapping.joints, lengths)]
 
 
 def _strange_rate(period: float) -> list[str]:
@@ -420,13 +442,18 @@ def _refuse_non_finite(values: Floats, joints: tuple[str, ...], place: str, firs
         )
 
 
-def _convert(mapping: LogMapping, name: str, signal: Signal, raw: Floats) -> Floats:
-    """Values (n, joints) at the joint: the formulas at the head of `ident.import_log.mapping`."""
+def _convert(
+    mapping: LogMapping, name: str, signal: Signal, raw: Floats
+) -> tuple[Floats, list[NDArray[np.int64]]]:
+    """Values (n, joints) at the joint by the formulas at the head of `ident.import_log.mapping`, and their wraps."""
     values = raw * signal.factors(len(mapping.joints), name)
+    wraps = [np.zeros(0, dtype=np.int64)] * len(mapping.joints)
+    if signal.quantity == "angle" and signal.unit != "m":
+        values, wraps = unwrapped(values)
     if signal.before_gear:
         matrix = mapping.matrix
         values = values @ (matrix if signal.quantity == "torque" else np.linalg.inv(matrix).T)
-    return values + mapping.offset if signal.quantity == "angle" else values
+    return (values + mapping.offset if signal.quantity == "angle" else values), wraps
 
 
 def _write(writer: SessionWriter, channels: Mapping[str, _Channel]) -> None:

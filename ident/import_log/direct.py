@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import tempfile
 from dataclasses import replace
@@ -17,6 +18,8 @@ from ident.import_log.conversion import import_log
 from ident.import_log.mapping import LogMapping, Signal, TimeBase, Unit
 from lwr_driver.session import Session, read_session
 from lwr_driver.session.writer import LIBRARY
+
+logger = logging.getLogger(__name__)
 
 _HEAD_BYTES = 256
 
@@ -40,8 +43,10 @@ def read_recording(path: str | os.PathLike[str], *, status: bool = True, motor: 
     mapping = bag_mapping(bag, motor=motor)
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / f"{source.stem}.mcap"
-        import_log(mapping, source, target, urdf=None)
+        report = import_log(mapping, source, target, urdf=None)
         session = read_session(target, status=status)
+    for turned in report.unwrapped:
+        logger.warning("%s: %s", source.name, turned)
     metadata = {**session.metadata, "joints": AS_RECORDED}
     return replace(session, path=source, metadata=metadata, robot_description=bag.robot_description)
 

@@ -39,10 +39,12 @@ _FEWEST, _FROZEN_S = 5, 0.05
 _JUMP, _NEARLY_ALL, _HALT = 2.0, 0.999, 10.0
 STEP_RAD = 2.0 * np.pi / 4096.0
 """Step of an encoder of 12 bits [rad], no jump."""
+# Least speed of a jump over the speeds of so many steps on either side, and over nearly all others of the recording.
+_BESIDE, _AROUND, _BEYOND_ALL = 10.0, 5, 3.0
 # A frozen torque: least length over nearly all (the quantile) of its other runs of one value, and least share of the
 # samples at that value in one run. A dead zone or a coarse sensor comes back to its values again and again.
 _LONGER, _NEARLY, _ONE_RUN = 20.0, 0.99, 0.8
-# Latest recordings whose frozen positions are known: an estimator prepares a session several times.
+# Latest recordings whose frozen positions and jumps are known: an estimator prepares a session several times.
 _MOST_KNOWN = 64
 # Least way of a joint in two seconds, or speed for a shorter time, to be in motion [rad or m].
 _WAY, _WAY_S = 0.05, 2.0
@@ -98,6 +100,15 @@ class Frozen:
     joint: int
     first: int
     last: int
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A joint (from 0) that is elsewhere by `size` [rad or m] in the sample `behind`, without a motion there."""
+
+    joint: int
+    behind: int
+    size: float
 
 
 def sample_loss(sessions: list[Session]) -> tuple[SampleLoss, ...]:
@@ -211,6 +222,48 @@ def _frozen_positions(times: Floats, position: Floats) -> tuple[Frozen, ...]:
             if jumped or halted:
                 found.append(Frozen(joint, start, end))
     return tuple(found)
+
+
+def position_jumps(columns: JointColumns) -> tuple[Jump, ...]:
+    """Steps of single positions far beyond the speeds before and after and beyond all others of the recording.
+
+    An angle that wraps, a joint zeroed anew, and samples missing without a gap in the stamps do that. A joint with mass
+    passes all speeds in between, and a single wrong sample jumps back. Ordered by sample.
+    """
+    clock = columns.publish_time if np.ptp(columns.publish_time) > 0 else columns.log_time
+    return _jumps.of(jumps, (clock - clock[:1]) * 1e-9, columns.position)
+
+
+_jumps = Kept[tuple[Jump, ...]](_MOST_KNOWN)
+
+
+def jumps(times: Floats, position: Floats) -> tuple[Jump, ...]:
+    """`position_jumps` of positions (N, J) [rad or m] at times (N,) [s]."""
+    if len(times) < 2 * _AROUND + 2:
+        return ()
+    period = max(float(np.median(np.diff(times))), 1e-9)
+    found = []
+    for joint in range(position.shape[1]):
+        values = column(position, joint)
+        # A value held for some samples, by an encoder's steps or a slower source, is left at the speed since it came.
+        fresh = run_bounds(values)[:-1]
+        way = np.diff(values[fresh])
+        if len(way) < 2 * _AROUND + 1:
+            continue
+        speed = np.abs(way) / np.maximum(np.diff(times[fresh]), period)
+        beside = np.zeros(len(speed))
+        for k in range(1, _AROUND + 1):
+            np.maximum(beside[k:], speed[:-k], out=beside[k:])
+            np.maximum(beside[:-k], speed[k:], out=beside[:-k])
+        alone = (speed > _BESIDE * beside) & (np.abs(way) > max(STEP_RAD, _STEPS * float(np.abs(way).min())))
+        if not alone.any():
+            continue
+        usual = float(np.quantile(speed[~alone], _NEARLY_ALL))
+        found += [
+            Jump(joint, int(fresh[k + 1]), float(way[k]))
+            for k in np.flatnonzero(alone & (speed > _BEYOND_ALL * usual))
+        ]
+    return tuple(sorted(found, key=lambda jump: (jump.behind, jump.joint)))
 
 
 def frozen_torques(effort: Floats, times: Floats, path_times: Floats, path: Floats) -> tuple[Frozen, ...]:

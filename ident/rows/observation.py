@@ -25,6 +25,7 @@ from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.estimators.problem import Nuisance, Problem, RowGroup
 from ident.rows.binned import is_zero
+from ident.rows.data_quality import jumps
 from ident.rows.filters import (
     ParallelFilter,
     block_means,
@@ -342,7 +343,8 @@ def commanded(session: Session, prepared: PreparedSession) -> PreparedSession | 
     where = f"{prepared.name}: /joint_command"
     dt = sample_period(times, command.sequence if command.numbered else None, where)
     bad: NDArray[np.bool_] = np.asarray(~np.isfinite(command.position).all(axis=1))
-    parts, _ = stretches(times, command.position, bad, dt, prepared.settings.longest_bridge_s)
+    wraps = [jump.behind for jump in jumps(times, command.position)]
+    parts, _ = stretches(times, command.position, bad, dt, prepared.settings.longest_bridge_s, wraps)
     passages = []
     for passage in prepared.passages:
         channels = [channel for channel in (passage.joint, passage.motor) if channel is not None]

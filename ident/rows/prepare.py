@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import Floats
 from ident.rows.content import Recall
-from ident.rows.data_quality import Frozen, frozen_flags, frozen_positions, frozen_torques, held, stale
+from ident.rows.data_quality import (
+    Frozen,
+    Jump,
+    frozen_flags,
+    frozen_positions,
+    frozen_torques,
+    held,
+    position_jumps,
+    stale,
+)
 from ident.rows.delay import DELAY_HZ, DISAGREEMENT, Delay, DelayData, estimate_delay
 from ident.rows.filtered_motion import (
     Motion,
@@ -104,7 +113,8 @@ def prepare(
         )
     unseen = frozen_flags(seen.positions, position.shape).any(axis=1)
     bad: BoolArray = np.asarray(position_flags.any(axis=1)) | seen.stale | unseen
-    parts, lost = stretches(times, (position, effort), bad, dt, settings.longest_bridge_s)
+    jumps = [jump.behind for jump in seen.jumps]
+    parts, lost = stretches(times, (position, effort), bad, dt, settings.longest_bridge_s, jumps)
     if not parts:
         raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
     windows, periods = _windows(session, times)
@@ -124,6 +134,7 @@ def prepare(
         "joint_torque_held": int(kept.sum()),
         "joint_torque_frozen": int(stuck.sum()),
         "position_frozen": int(unseen.sum()),
+        "position_jumps": len(set(jumps)),
     }
     # A tenth of a gigabyte for an hour.
     del parts, longest, position_flags, effort_flags, kept, stuck, unseen, bad, times
@@ -206,13 +217,14 @@ class _Seen:
     """What the joint channel shows of its samples, whatever the settings.
 
     stale : (N,), older than their stamps or repeated. held : (N,), with torques kept in all joints. positions,
-    torques : frozen ones. moving : names of the moving joints.
+    torques : frozen ones. jumps : of the positions. moving : names of the moving joints.
     """
 
     stale: BoolArray
     held: BoolArray
     positions: tuple[Frozen, ...]
     torques: tuple[Frozen, ...]
+    jumps: tuple[Jump, ...]
     moving: tuple[str, ...]
 
 
@@ -229,6 +241,7 @@ def _seen(joint: JointColumns, times: Floats, clock: SampleClock | None) -> _See
         held(effort, times, times, position) if sensed else np.zeros(len(times), dtype=bool),
         frozen_positions(joint),
         frozen_torques(effort, times, times, position) if sensed else (),
+        position_jumps(joint),
         moving(position, joint.names),
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -107,12 +108,18 @@ def sample_period(times: Floats, sequence: NDArray[np.int64] | None, where: str)
 
 
 def stretches(
-    times: Floats, columns: Floats | tuple[Floats, ...], bad: BoolArray, dt: float, longest_bridge_s: float
+    times: Floats,
+    columns: Floats | tuple[Floats, ...],
+    bad: BoolArray,
+    dt: float,
+    longest_bridge_s: float,
+    behind: Iterable[int] = (),
 ) -> tuple[list[Stretch], int]:
     """Equidistant stretches of (n, k) columns at (n,) times, and the number of samples lost.
 
     Samples flagged `bad` (n,) and lost ones are bridged by a cubic spline through their neighbours and
-    flagged; a hole longer than `longest_bridge_s` ends the stretch.
+    flagged; a hole longer than `longest_bridge_s` ends the stretch, and so does a jump of a position. behind : numbers
+    of the samples behind jumps.
     """
     good = np.flatnonzero(~bad)
     if len(good) < 16:
@@ -120,6 +127,10 @@ def stretches(
     intervals = np.diff(times)
     lost = int(np.sum(np.maximum(np.rint(intervals[intervals > 1.75 * dt] / dt) - 1, 0)))
     hole = np.diff(times[good]) > longest_bridge_s + 1.75 * dt
+    for sample in behind:
+        # The good samples before and behind it are no neighbours.
+        after = int(np.searchsorted(good, sample))
+        hole[after - 1 : after] = True
     parts = np.split(good, np.flatnonzero(hole) + 1)
     sides = columns if isinstance(columns, tuple) else (columns,)
     return [_uniform(times[part], sides, part, dt) for part in parts if len(part) >= 16], lost

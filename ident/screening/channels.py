@@ -15,10 +15,12 @@ from ident.rows.content import content
 from ident.rows.data_quality import (
     STEP_RAD,
     Frozen,
+    Jump,
     clipped_at,
     frozen_positions,
     frozen_torques,
     held,
+    position_jumps,
     run_bounds,
     stuck_at,
 )
@@ -44,6 +46,8 @@ _CORNERS, _TOP, _SHARP, _LAG_S = 2, 5, 2.0, 0.02
 _OFTEN = 0.05
 # Samples within which the torques of nearly all sensors change.
 _SOON = 100
+# Largest distance of a jump from one turn, as a share of it, for an angle that wraps.
+_TURN = 0.02
 # Least time [s] of torques kept in all joints at once to be told; shorter ones are usual in a network.
 _TOGETHER_S = 0.1
 
@@ -56,7 +60,7 @@ def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
         frozen = list(_frozen(session))
         named = {(doubt.channel, doubt.joints) for doubt in frozen}
         clipped = [doubt for doubt in _clipped(session) if (doubt.channel, doubt.joints) not in named]
-        found += [*_clocks(session), *frozen, *clipped, *_velocity(session)]
+        found += [*_clocks(session), *frozen, *_jumps(session, chain), *clipped, *_velocity(session)]
     return found
 
 
@@ -288,6 +292,54 @@ def _frozen(session: Session) -> Iterator[Doubt]:
     rest = [run for k, run in enumerate(_standing(session)) if run is not None and k not in jumping]
     for run in rest:
         yield from _stopped(session, "position", path_times, joint.position, (run,), kept=True)
+
+
+def jump_doubts(
+    found: Sequence[Jump], times: Floats, names: Sequence[str], prismatic: Sequence[bool], session: str = ""
+) -> list[Doubt]:
+    """Positions elsewhere in the next sample: by a turn, or by anything. times : of the samples [s].
+
+    names, prismatic : of the joints.
+    """
+    turns = [jump for jump in found if abs(abs(jump.size) / (2.0 * np.pi) - 1.0) < _TURN]
+    others = [jump for jump in found if jump not in turns]
+
+    def doubt(some: Sequence[Jump], size: str, looks: str, mend: str) -> Doubt:
+        joints = sorted({jump.joint for jump in some})
+        places = sorted({jump.behind for jump in some})
+        again = len(places) - 1
+        more = f" and {again} more time{'s' if again > 1 else ''}" if again else ""
+        verb = "jumps" if len(joints) == 1 else "jump"
+        seen = f"{verb} by {size} in one sample at {times[places[0]]:.4g} s{more}"
+        mend = f"{mend}; rows are built on either side only"
+        return Doubt("position", tuple(names[k] for k in joints), seen, looks, mend, False, session)
+
+    doubts = [
+        doubt(
+            [jump for jump in turns if jump.joint == joint],
+            "360 deg",
+            "an angle that wraps",
+            "import the recording with `lwr-run import`, which unwraps it",
+        )
+        for joint in sorted({jump.joint for jump in turns})
+    ]
+    if others:
+        largest = max(others, key=lambda jump: abs(jump.size))
+        size = f"{'up to ' if len(others) > 1 else ''}{abs(largest.size):.3g}"
+        looks = "samples missing without a gap in the stamps"
+        if len({jump.joint for jump in others}) == 1:
+            looks += ", or a joint zeroed anew"
+        unit = "m" if prismatic[largest.joint] else "rad"
+        mend = "give the samples the times of their source, or cut the log there"
+        doubts.append(doubt(others, f"{size} {unit}", looks, mend))
+    return doubts
+
+
+def _jumps(session: Session, chain: Chain) -> list[Doubt]:
+    log = session.joint.log_time
+    times = np.asarray((log - log[:1]) * 1e-9, dtype=np.float64)
+    found = position_jumps(session.joint)
+    return jump_doubts(found, times, session.joint_names, chain.prismatic.tolist(), session.path.name)
 
 
 def _stopped(

@@ -282,3 +282,23 @@ def test_command_imports_and_reports(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", sorted((CONFIGS / "imports").glob("*.yaml")), ids=lambda path: path.stem)
 def test_shipped_mappings_parse(path: Path) -> None:
     assert LogMapping.load(path.stem).robot
+
+
+def test_an_angle_that_wraps_is_unwrapped_and_a_jump_is_told(tmp_path: Path) -> None:
+    time = np.arange(600) * 0.01
+    turning, zeroed = 3.0 + np.sin(time), np.cos(time)
+    wrapped = (turning + np.pi) % (2.0 * np.pi) - np.pi
+    zeroed[400:] += 0.8
+    source = write_csv(tmp_path, 600, qa=wrapped, qb=zeroed)
+    report = import_log(mapping(), source, tmp_path / "out.mcap")
+    position = read_session(tmp_path / "out.mcap").joint.position
+    np.testing.assert_allclose(position[:, 0], turning, atol=1e-12)
+    np.testing.assert_array_equal(position[:, 1], zeroed)
+    behind = 0.01 * (1 + int(np.argmax(np.abs(np.diff(wrapped)) > 3.0)))
+    assert report.unwrapped == (
+        f"position of a: 2 steps of 360 deg in one sample taken back, first at {behind:.4g} s",
+    )
+    assert f"  unwrapped {report.unwrapped[0]}\n" in str(report)
+    assert any(
+        note.startswith("b position: jumps by 0.808 rad in one sample at 4 s") for note in report.notes
+    )

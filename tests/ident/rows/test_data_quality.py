@@ -12,6 +12,7 @@ from ident.rows.data_quality import (
     SampleLoss,
     clipped_at,
     held,
+    jumps,
     passed_band,
     sample_loss,
     stale,
@@ -245,3 +246,45 @@ def test_the_limit_of_a_single_joint_is_found():
     whole = columns(np.clip(noisy(), -np.inf, 8.0))
     one = replace(whole, names=("a",), position=whole.position[:, :1], effort=whole.effort[:, :1])
     assert clipped_at(one).tolist() == [8.0]
+
+
+def swings(count: int = COUNT) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and positions (n, 2) with the noise of an encoder."""
+    time = np.arange(count) / RATE
+    noise = 2e-5 * np.random.default_rng(3).normal(size=(count, 2))
+    return time, np.column_stack([np.sin(time), 0.5 * np.cos(1.3 * time)]) + noise
+
+
+@pytest.mark.parametrize("size", [-2.0 * np.pi, 0.3])
+def test_a_position_elsewhere_in_the_next_sample_is_a_jump(size: float) -> None:
+    time, position = swings()
+    position[900:, 1] += size
+    (found,) = jumps(time, position)
+    assert (found.joint, found.behind) == (1, 900)
+    assert found.size == pytest.approx(size, abs=0.01)
+
+
+def test_samples_left_out_are_a_jump_unless_the_stamps_say_so() -> None:
+    time, position = swings()
+    kept = np.delete(np.arange(COUNT), np.arange(700, 1000))
+    closed = jumps(time[: len(kept)], position[kept])
+    assert {jump.behind for jump in closed} == {700}
+    assert jumps(time[kept], position[kept]) == ()
+
+
+def test_wrong_samples_noise_steps_and_sudden_motion_are_no_jumps() -> None:
+    time, position = swings()
+    spikes = position.copy()
+    spikes[[300, 800], 0] += 1.0
+    spikes[1200:1203, 1] -= 0.7
+    held = position[np.arange(COUNT) // 7 * 7]
+    coarse = np.round(position / 0.0015) * 0.0015
+    starting = np.where(
+        time[:, None] < 4.0, position[:1], position[:1] + np.maximum(time - 4.0, 0.0)[:, None]
+    )
+    late = position.copy()
+    for row in range(100, COUNT - 10, 97):
+        late[row : row + 4] = late[row - 1]
+    noise = 1e-3 * np.random.default_rng(5).normal(size=position.shape)
+    for healthy in (position, spikes, held, coarse, starting, late, noise, position[:9], 0.0 * position):
+        assert jumps(time[: len(healthy)], healthy) == ()

@@ -432,3 +432,20 @@ def test_a_stretch_of_a_few_samples_between_gaps_gives_no_row_and_no_error(extra
         assert all(
             np.isfinite(group.matrix).all() and np.isfinite(group.target).all() for group in rows.groups
         )
+
+
+def test_no_row_is_built_across_a_jump_of_a_position() -> None:
+    session = arm.session(motor=False, period_s=6.0)
+    whole, turned = session.joint.position, session.joint.position.copy()
+    turned[1000:, 4] -= 2.0 * np.pi
+    before, after = (
+        prepare(replace(session, joint=replace(session.joint, position=q)), advise=False)
+        for q in (whole, turned)
+    )
+    jump = session.joint.publish_time[1000] * 1e-9 - session.joint.publish_time[0] * 1e-9
+    assert (before.counts["position_jumps"], before.counts["stretches"]) == (0, 1)
+    assert (after.counts["position_jumps"], after.counts["stretches"]) == (1, 2)
+    rows = np.concatenate([passage.rows for passage in after.passages])
+    assert np.abs(rows - jump).min() > 0.05
+    speeds = [np.abs(p.joint.qd).max() for part in (before, after) for p in part.passages]
+    assert max(speeds[1:]) < 1.05 * speeds[0]

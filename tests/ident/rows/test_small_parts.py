@@ -629,3 +629,11 @@ def test_a_filter_gives_the_same_on_each_use_whether_its_weights_are_kept(
     for values in (np.sin(times)[:, None], np.cos(3.0 * times)[:, None]):
         rows = [weights @ values[samples] for _, samples, weights in parallel.blocks()]
         assert np.array_equal(parallel.apply(values), np.concatenate(rows))
+
+
+def test_a_commanded_motion_that_jumps_is_no_motion() -> None:
+    session = arm.session(motor=False, command=True)
+    position = session.command.position.copy()
+    position[1500:, 2] -= 2.0 * np.pi
+    jumping = replace(session, command=replace(session.command, position=position))
+    assert commanded(jumping, prepare(jumping, advise=False)) is None

@@ -505,3 +505,28 @@ def test_a_message_says_channel_joint_sight_guess_and_remedy() -> None:
 )
 def test_factors_have_their_usual_causes(factor: float, words: str) -> None:
     assert words in unit_of(factor)
+
+
+def jumping(where: Session, joint: int, size: float, sample: int = 2000) -> Session:
+    position = where.joint.position.copy()
+    position[sample:, joint] += size
+    return replace(where, joint=replace(where.joint, position=position))
+
+
+def test_a_position_that_jumps_is_told_with_time_size_and_advice(pair: list[Session]) -> None:
+    bare = replace(pair[0], command=None)
+    (turn,) = check_channels([jumping(bare, 4, -2.0 * np.pi)], chain())
+    at = (bare.joint.log_time[2000] - bare.joint.log_time[0]) * 1e-9
+    assert not turn.certain
+    assert turn.joints == (bare.joint_names[4],)
+    assert str(turn).endswith(
+        f"jumps by 360 deg in one sample at {at:.4g} s, looks like an angle that wraps; import the recording with "
+        "`lwr-run import`, which unwraps it; rows are built on either side only"
+    )
+    (zeroed,) = check_channels([jumping(jumping(bare, 2, 0.4), 2, -0.1, 2400)], chain())
+    assert "jumps by up to 0.399 rad" in zeroed.seen
+    assert "and 1 more time" in zeroed.seen
+    assert "or a joint zeroed anew" in zeroed.looks_like
+    (missing,) = check_channels([jumping(jumping(bare, 2, 0.4), 3, -0.1)], chain())
+    assert missing.joints == bare.joint_names[2:4]
+    assert missing.looks_like == "samples missing without a gap in the stamps"
