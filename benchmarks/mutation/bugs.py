@@ -192,8 +192,8 @@ BUGS: tuple[Bug, ...] = (
     Bug(
         "a torque that is a copy of another joint's is not named",
         "ident/screening/channels.py",
-        "        found += _copied(session)\n",
-        "",
+        "        found += [*_copied(session), *_both_sides(session)]\n",
+        "        found += [*_both_sides(session)]\n",
         ("tests/ident/screening/test_screen.py::test_a_torque_that_is_a_copy_of_another_joints_is_an_error",),
     ),
 )

@@ -18,17 +18,19 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.urdf import Urdf, read_urdf
 from ident.import_log.fields import Field, fields
 from ident.import_log.mapping import LogMapping, Signal, TimeBase, Transmission, Unit
+from ident.import_log.rates import ALIKE, Rates, compare
 from ident.import_log.recording import Recording
 from ident.import_log.tables import Floats
+from ident.import_log.turns import unwrapped
 from lwr_driver.configuration import yaml_text
 from lwr_driver.listing import Listing, Piece, text_of
 
 _RATES = {"rad/s": 1.0, "deg/s": 180.0 / math.pi, "rpm": 30.0 / math.pi}
 _SHORTEST_S, _LONGEST_S = 1e-4, 0.1
-_ALIKE = 0.9
-"""Least correlation of a channel with the derivative of another, to be taken for it."""
 _RATIO = 1.5
 """Largest factor between dq/dt and a velocity in the right unit; the units are factors of 5 apart."""
+_OFF, _SPREAD = 0.03, 0.25
+"""Least deviation of that factor that is said if all joints agree, and their largest spread over it."""
 _LARGEST_CURRENT_A = 200.0
 _UNIX_S = 1e9
 _SLACK = 0.05
@@ -142,17 +144,24 @@ class _Guesser:
         unit, reason = self._angle_unit(position, joints)
         if self.known.joints and picked is not whole:
             rests = self._rests(whole, joints, unit)
-        angle = position.values * (math.pi / 180.0 if unit == "deg" else 1.0)
+        angle, _ = unwrapped(position.values * (math.pi / 180.0 if unit == "deg" else 1.0))
         velocity = self._finite(self._best("velocity", joints))
-        time, period = self._time(angle, velocity, unit)
+        time, times = self._time(angle, velocity, unit)
+        rates = None if velocity is None else compare(angle, velocity.values, times)
+        if velocity is not None and rates is not None:
+            self._one_unit(position, velocity, joints, rates, unit)
         signals: dict[str, Any] = {"position": self._take("position", position, unit, reason)}
-        if velocity is not None and (rate := _rate_unit(angle, velocity.values, period)) is not None:
-            name, factor = rate
-            signals["velocity"] = self._take(
-                "velocity", velocity, name, f"{factor:.2f} times dq/dt in this unit"
-            )
-        elif velocity is not None:
-            self.reasons[velocity.name] = "not dq/dt of the positions in any unit"
+        if velocity is not None and rates is not None and velocity.name not in self.reasons:
+            if (found := _rate_unit(rates)) is not None:
+                name, factor = found
+                why_rate = f"{factor:.2f} times dq/dt in this unit"
+                if _same_in_all(rates, factor):
+                    why_rate += ", in all joints: a clock or a scale is off"
+                signals["velocity"] = self._take("velocity", velocity, name, why_rate)
+            else:
+                unlike = rates.unlike.tolist() if len(rates.unlike) < len(joints) else []
+                which = f", at {', '.join(joints[k] for k in unlike)}" if unlike else ""
+                self.reasons[velocity.name] = f"not dq/dt of the positions in any unit{which}"
         signals |= self._torques(joints)
         self.rows.append(("joints", _span(joints), "", why))
         gear = any(signal.before_gear for signal in signals.values())
@@ -289,12 +298,49 @@ class _Guesser:
             "or order of joints? Write a mapping file for `lwr-run import` (`transmission`, `offset_rad`, `joints`)"
         )
 
-    def _time(self, angle: Floats, velocity: Field | None, unit: str) -> tuple[TimeBase, float]:
-        """Times, and the mean time between samples [s]."""
+    def _one_unit(
+        self, position: Field, velocity: Field, joints: Sequence[str], rates: Rates, unit: str
+    ) -> None:
+        """Raise DataError for a position in another unit than the others, by dq/dt against the velocities.
+
+        A velocity in another unit than the others is left aside, and the reason noted.
+        """
+        factors = rates.by_channel
+        known = np.flatnonzero(np.isfinite(factors))
+        if len(known) < 3:
+            return
+        common = float(np.median(factors[known]))
+        off = np.abs(np.log(factors / common)) > math.log(_RATIO)
+        # Of a joint without a clear velocity nothing is known.
+        odd, fine = [k for k in known.tolist() if off[k]], [k for k in range(len(joints)) if not off[k]]
+        if not odd or 2 * len(odd) >= len(known):
+            return
+        rest = position.of([joints[k] for k in fine]) if set(joints) <= set(position.labels) else None
+        rest = rest or replace(position, values=position.values[:, fine])
+        of_rest, _ = self._angle_unit(rest, [joints[k] for k in fine])
+        degree = math.pi / 180.0
+        names = ", ".join(joints[k] for k in odd)
+        # What the numbers of the odd joints are to be multiplied with, to be like the others.
+        for other, size in (("deg", degree), ("rad", 1.0 / degree)):
+            like = all(abs(math.log(factors[k] / common / size)) < math.log(_RATIO) for k in odd)
+            if like and other != of_rest:
+                scale = ", ".join(f"{size if k in odd else 1.0:.6g}" for k in range(len(joints)))
+                raise DataError(
+                    f"{self.source}: {position.shown}: {names} in {other}, the other joints in {of_rest}, as dq/dt "
+                    f"against {velocity.shown} shows. Write a mapping file for `lwr-run import` with `unit: {of_rest}` "
+                    f"and `scale: [{scale}]` in `position`"
+                )
+        times = ", ".join(f"{factors[k] / common:.3g}" for k in odd)
+        self.reasons[velocity.name] = (
+            f"{times} times as large over dq/dt at {names} as at the others; `scale` in `velocity` mends it"
+        )
+
+    def _time(self, angle: Floats, velocity: Field | None, unit: str) -> tuple[TimeBase, Floats]:
+        """The time base, and the times of the samples (n,) [s] after the first."""
         count = len(angle)
         if self.known.rate_hz is not None:
             self.rows.append(("time", "", "", f"{self.known.rate_hz:g} Hz, as given"))
-            return TimeBase(rate_hz=self.known.rate_hz), 1.0 / self.known.rate_hz
+            return TimeBase(rate_hz=self.known.rate_hz), np.arange(count) / self.known.rate_hz
         clocks = [one for one in self.fields if one.quantity == "time" and len(one.values) == count]
         clocks = [one for one in clocks if (np.diff(one.values[:, 0]) >= 0).all() and np.ptp(one.values) > 0]
         if clocks:
@@ -302,19 +348,20 @@ class _Guesser:
             clock = min(clocks, key=lambda one: int(np.sum(np.diff(one.values[:, 0]) == 0)))
             return self._clock(clock)
         if velocity is not None:
-            slope, alike = _slope(velocity.values, np.diff(angle, axis=0))
-            period = slope * (math.pi / 180.0 if unit == "deg" else 1.0)
-            if alike > _ALIKE and _SHORTEST_S <= period <= _LONGEST_S:
+            steps = compare(angle, velocity.values, np.arange(count, dtype=np.float64))
+            # Velocities have the unit of the positions.
+            period = (_RATES["deg/s"] if unit == "deg" else 1.0) / max(steps.ratio, 1e-9)
+            if steps.alike > ALIKE and _SHORTEST_S <= period <= _LONGEST_S:
                 rate = float(f"{1.0 / period:.3g}")
                 self.rows.append(
                     ("time", "", "", f"{rate:g} Hz, from the positions against {velocity.shown}")
                 )
-                return TimeBase(rate_hz=rate), 1.0 / rate
+                return TimeBase(rate_hz=rate), np.arange(count) / rate
         raise DataError(
             f"{self.source}: no rising column of times; give the rate of the samples with --rate-hz"
         )
 
-    def _clock(self, clock: Field) -> tuple[TimeBase, float]:
+    def _clock(self, clock: Field) -> tuple[TimeBase, Floats]:
         times = clock.values[:, 0]
         step = float(times[-1] - times[0]) / (len(times) - 1)
         units: tuple[Literal["s", "ms", "us", "ns"], ...] = ("s", "ms", "us", "ns")
@@ -339,7 +386,9 @@ class _Guesser:
         why = f"steps of {step:.4g} on average" + (", equal times spread" if equal else "")
         self.used.add(clock.name)
         self.rows.append(("time", clock.shown, unit, why))
-        return found, step * base.seconds
+        seconds = (times - times[0]) * base.seconds
+        # Coarse stamps show the way on average only.
+        return found, np.linspace(0.0, seconds[-1], len(seconds)) if equal else seconds
 
     def _torques(self, joints: Sequence[str]) -> dict[str, Signal]:
         """Signals of the torques and currents."""
@@ -397,8 +446,9 @@ class _Guesser:
         for quantity in ("velocity", "acceleration"):
             if not parts:
                 break
-            scores = [_slope(part.values, np.diff(found[-1].values, axis=0))[1] for part in parts]
-            if max(scores) > _ALIKE:
+            count_up = np.arange(len(table.values), dtype=np.float64)
+            scores = [compare(found[-1].values, part.values, count_up).alike for part in parts]
+            if max(scores) > ALIKE:
                 found.append(replace(parts.pop(int(np.argmax(scores))), name=quantity))
                 self.why[quantity] = f"correlates {max(scores):.3f} with the change of {found[-2].shown}"
             else:
@@ -427,31 +477,20 @@ def _span(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
 
 
-def _slope(rate: Floats, change: Floats) -> tuple[float, float]:
-    """Least-squares factor from a rate (n, k) to the change between samples (n-1, k), and their correlation."""
-    mean = 0.5 * (rate[1:] + rate[:-1])
-    power = float(np.sum(mean * mean))
-    product = float(np.sum(mean * change))
-    whole = math.sqrt(power * float(np.sum(change * change)))
-    return (product / power, product / whole) if whole > 0.0 else (0.0, 0.0)
-
-
-def _rate_unit(angle: Floats, rate: Floats, period: float) -> tuple[str, float] | None:
+def _rate_unit(rates: Rates) -> tuple[str, float] | None:
     """Unit of a velocity by dq/dt, and its ratio to that in the unit; None if it is no velocity of these joints."""
-    # Over a fiftieth of a second, so that steps of an encoder and repeated samples count little.
-    width = max(1, min(round(0.02 / period), len(angle) // 4))
-    total = np.vstack([np.zeros(rate.shape[1]), np.cumsum(0.5 * (rate[1:] + rate[:-1]), axis=0)])
-    mean, change = (
-        (total[width:] - total[:-width]) / width,
-        (angle[width:] - angle[:-width]) / (width * period),
-    )
-    power = float(np.sum(change * change))
-    whole = math.sqrt(power * float(np.sum(mean * mean)))
-    if whole == 0.0 or float(np.sum(mean * change)) < _ALIKE * whole:
+    if rates.alike < ALIKE:
         return None
-    ratio = float(np.sum(mean * change)) / power
-    unit, size = min(_RATES.items(), key=lambda item: abs(math.log(ratio / item[1])))
-    return (unit, ratio / size) if abs(math.log(ratio / size)) < math.log(_RATIO) else None
+    unit, size = min(_RATES.items(), key=lambda item: abs(math.log(rates.ratio / item[1])))
+    return (unit, rates.ratio / size) if abs(math.log(rates.ratio / size)) < math.log(_RATIO) else None
+
+
+def _same_in_all(rates: Rates, factor: float) -> bool:
+    """Whether the joints agree about a factor off 1."""
+    found = rates.by_channel / rates.ratio
+    found = found[np.isfinite(found)]
+    off = abs(factor - 1.0)
+    return len(found) > 1 and off > _OFF and bool(np.max(np.abs(found - 1.0)) < _SPREAD * off)
 
 
 def _torque_unit(field: Field) -> str:

@@ -33,6 +33,9 @@ from lwr_driver.session.spool import column
 _RATES, _LONG_S = (10.0, 20_000.0), 2.0
 # Difference of two clocks or of dq/dt and velocity beyond filters and jitter; beyond the second one is a wrong unit.
 _CLOCKS, _SPEEDS, _UNIT = 0.02, 0.15, 1.5
+# Least difference of dq/dt and velocity that is the same in all joints, and largest spread of the joints over it: real
+# velocities, filtered by their drives, differ by 0.8 % and less.
+_COMMON, _SPREAD = 0.03, 0.25
 # Blocks of the comparison with the velocity: least samples, least time [s]; least movement of a joint [rad or m].
 _BLOCK, _BLOCK_S, _MOVED = 5, 0.05, 0.05
 _CORRELATED = 0.9
@@ -56,7 +59,7 @@ def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts about the channels of sessions with the joints of `chain`."""
     found = [*_repeated(sessions), *_never_moving(sessions), *_dead(sessions)]
     for session in sessions:
-        found += _copied(session)
+        found += [*_copied(session), *_both_sides(session)]
         frozen = list(_frozen(session))
         named = {(doubt.channel, doubt.joints) for doubt in frozen}
         clipped = [doubt for doubt in _clipped(session) if (doubt.channel, doubt.joints) not in named]
@@ -250,6 +253,26 @@ def _copied(session: Session) -> Iterator[Doubt]:
             yield _copies(session, "position", joints, certain=False)
         elif len(_alike(command.position[:, [command.names.index(name) for name in names]])) != 1:
             yield _copies(session, "position", joints, certain=True)
+
+
+def _both_sides(session: Session) -> Iterator[Doubt]:
+    """Motor torques equal to the last bit to the joint torques, as no two sensors are."""
+    joint, motor = session.joint, session.motor
+    if motor is None or motor.effort.shape != joint.effort.shape:
+        return
+    same = [
+        k
+        for k in range(joint.effort.shape[1])
+        if np.ptp(own := column(motor.effort, k)) > 0.0 and np.array_equal(own, column(joint.effort, k))
+    ]
+    if same:
+        seen = "is the joint torque to the last bit in every sample"
+        looks = "one column taken for both sides"
+        mend = (
+            "import the side that was measured only, or leave the motor torques aside (Model 1, `--model 1`)"
+        )
+        names = tuple(session.joint_names[k] for k in same)
+        yield Doubt("motor torque", names, seen, looks, mend, True, session.path.name)
 
 
 def _alike(values: Floats) -> list[list[int]]:
@@ -549,7 +572,10 @@ def _velocity(session: Session) -> Iterator[Doubt]:
         factors[k] = float(own @ speed / (speed @ speed))
     wrong = {k: f for k, f in factors.items() if abs(f - 1.0) > _SPEEDS}
     common = float(np.median(list(factors.values()))) if factors else 1.0
-    if len(wrong) == len(factors) > 1 and all(abs(f / common - 1.0) < _SPEEDS for f in wrong.values()):
+    spread = max((abs(f / common - 1.0) for f in factors.values()), default=0.0)
+    beside = abs(common - 1.0)
+    shared = len(wrong) == len(factors) and spread < _SPEEDS
+    if len(factors) > 1 and (shared or (beside > _COMMON and spread < _SPREAD * beside)):
         seen = f"the velocities of all joints are {common:.4g} times dq/dt"
         known = [unit for value, unit in _SPEED_UNITS.items() if abs(common / value - 1.0) < _SPEEDS]
         if known:
@@ -560,6 +586,9 @@ def _velocity(session: Session) -> Iterator[Doubt]:
             return
         looks = f"stamps that pass {common:.4g} times too fast, or velocities in another unit"
         mend = "state the unit of time, or the factor of the velocities, when importing"
+        if not shared:
+            looks = f"stamps that pass {common:.4g} times too fast, or a wrong scale of the velocities"
+            mend = "check the rate of the recording; inertia is wrong by the square of the rate's error"
         yield Doubt("time", (), seen, looks, mend, _by_unit(common), name)
         return
     for k, factor in wrong.items():

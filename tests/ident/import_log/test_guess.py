@@ -302,3 +302,62 @@ def test_a_velocity_left_out_is_followed_by_the_reason(arm: Path, tmp_path: Path
         assert guess.mapping.velocity is None
         assert guess.unused == (f"dq1 ... dq7 ({reason})",)
         assert f"not used: dq1 ... dq7 ({reason})" in str(guess)
+
+
+def moving(arm: Path, tmp_path: Path, q: np.ndarray, qd: np.ndarray, t: np.ndarray = T) -> Guess:
+    names = ["t", *columns("q{k}"), *columns("dq{k}"), *columns("tau{k}")]
+    return guess_mapping(write(tmp_path / "run.csv", names, t, q, qd, TAU), arm)
+
+
+def test_velocities_stay_beside_a_hole_a_jump_and_a_wrap(arm: Path, tmp_path: Path) -> None:
+    jump, wrap = Q.copy(), Q.copy()
+    jump[250:] += 0.7
+    wrap[:, 6] = (Q[:, 6] + 3.0 + np.pi) % (2.0 * np.pi) - np.pi
+    late = np.where(T > 0.8, T + 3.0, T)
+    assert np.ptp(wrap[:, 6]) > 6.0
+    for q, t in ((jump, T), (wrap, T), (Q, late)):
+        guess = moving(arm, tmp_path, q, QD, t)
+        assert guess.mapping.velocity is not None
+        assert "1.00 times dq/dt" in str(guess)
+
+
+@pytest.mark.parametrize("joint", [1, 3])
+def test_a_position_in_another_unit_than_the_others_is_named(joint: int, arm: Path, tmp_path: Path) -> None:
+    some = Q.copy()
+    some[:, joint] *= DEG
+    scale = ", ".join("0.0174533" if k == joint else "1" for k in range(7))
+    with pytest.raises(DataError, match=f"{JOINTS[joint]} in deg, the other joints in rad.*") as error:
+        moving(arm, tmp_path, some, QD)
+    assert f"`unit: rad` and `scale: [{scale}]` in `position`" in str(error.value)
+    others = Q * DEG
+    others[:, joint] = Q[:, joint]
+    with pytest.raises(DataError, match=f"{JOINTS[joint]} in rad, the other joints in deg"):
+        moving(arm, tmp_path, others, QD)
+
+
+def test_a_velocity_in_another_unit_than_the_others_is_left_out_with_the_reason(
+    arm: Path, tmp_path: Path
+) -> None:
+    some = QD.copy()
+    some[:, 2] *= DEG
+    guess = moving(arm, tmp_path, Q, some)
+    assert guess.mapping.velocity is None
+    assert f"57.3 times as large over dq/dt at {JOINTS[2]} as at the others" in str(guess)
+    some[:, 2] = 5.0 * np.random.default_rng(1).normal(size=N)
+    assert f"not dq/dt of the positions in any unit, at {JOINTS[2]}" in str(moving(arm, tmp_path, Q, some))
+
+
+def test_a_factor_of_all_velocities_alike_is_said(arm: Path, tmp_path: Path) -> None:
+    said = "a clock or a scale is off"
+    assert f"1.10 times dq/dt in this unit, in all joints: {said}" in str(moving(arm, tmp_path, Q, 1.1 * QD))
+    spread = 1.0 + 0.05 * np.arange(7)
+    for healthy in (QD, 1.02 * QD, spread * QD):
+        assert said not in str(moving(arm, tmp_path, Q, healthy))
+
+
+def test_a_rate_follows_from_velocities_in_degrees(arm: Path, tmp_path: Path) -> None:
+    names = [*columns("q{k}"), *columns("dq{k}"), *columns("tau{k}")]
+    guess = guess_mapping(write(tmp_path / "run.csv", names, DEG * Q, DEG * QD, TAU), arm)
+    assert guess.mapping.time.rate_hz == RATE
+    assert guess.mapping.velocity is not None
+    assert guess.mapping.velocity.unit == "deg/s"

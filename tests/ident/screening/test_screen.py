@@ -530,3 +530,29 @@ def test_a_position_that_jumps_is_told_with_time_size_and_advice(pair: list[Sess
     (missing,) = check_channels([jumping(jumping(bare, 2, 0.4), 3, -0.1)], chain())
     assert missing.joints == bare.joint_names[2:4]
     assert missing.looks_like == "samples missing without a gap in the stamps"
+
+
+def test_velocities_off_by_some_per_cent_in_all_joints_alike_are_told(pair: list[Session]) -> None:
+    names = chain().joint_names
+    slow = check_channels(with_speed(None, 1.05, *names)(pair[:1]), chain())
+    assert [(doubt.channel, doubt.certain) for doubt in slow] == [("time", False)]
+    assert slow[0].seen == "the velocities of all joints are 1.05 times dq/dt"
+    assert slow[0].looks_like == "stamps that pass 1.05 times too fast, or a wrong scale of the velocities"
+    assert check_channels(with_speed(None, 1.02, *names)(pair[:1]), chain()) == []
+    assert check_channels(with_speed(None, 1.08, *names[:5])(pair[:1]), chain()) == []
+
+
+def test_motor_torques_that_are_a_copy_of_the_joint_torques_are_named(pair: list[Session]) -> None:
+    joint, motor = pair[0].joint, pair[0].motor
+    assert motor is not None
+    copied = replace(pair[0], motor=replace(joint, topic=motor.topic))
+    (found,) = screen([copied], chain())
+    assert (found.channel, found.joints, found.certain) == ("motor torque", chain().joint_names, True)
+    assert found.seen == "is the joint torque to the last bit in every sample"
+    assert "`--model 1`" in found.mend
+    # The joint torques are as good as before.
+    assert screen([copied], chain(), motor=False) == ()
+    effort = joint.effort.copy()
+    effort[:, 1:] += 0.01
+    (found,) = screen([replace(copied, motor=replace(joint, effort=effort))], chain())
+    assert found.joints == chain().joint_names[:1]
