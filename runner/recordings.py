@@ -40,7 +40,7 @@ def guess_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--joints",
             metavar="A,B,...",
-            help="Joints of the columns, as in the URDF; default: by name or number.",
+            help="Joints of the model, as in the URDF; default: by name or number of the columns.",
         ),
         click.option(
             "--rate-hz",
@@ -93,14 +93,20 @@ def read_recordings(
     from ident.import_log.bag import bag_files
     from lwr_driver.session import read_session
 
+    named = () if joints is None else tuple(name.strip() for name in joints.split(","))
+
+    def read(path: Path) -> Session:
+        side = torque == "motor"
+        return read_recording(path, status=False, motor=side, joints=named, urdf=urdf, base=base, tip=tip)
+
     foreign = [path for path in paths if not (path.suffix == ".mcap" or bag_files(path))]
     if not foreign:
-        if joints or rate_hz or torque_constant or gear_ratio:
+        if rate_hz or torque_constant or gear_ratio:
             raise ConfigurationError(
-                f"{paths[0]} names its joints and quantities; --joints, --rate-hz, --torque-constant and "
-                "--gear-ratio are for recordings with guessed columns"
+                f"{paths[0]} names its joints and quantities; --rate-hz, --torque-constant and --gear-ratio are for "
+                "recordings with guessed columns"
             )
-        logs = [read_recording(path, status=False, motor=torque == "motor") for path in paths]
+        logs = [read(path) for path in paths]
         for log in logs[1:]:
             _same_rests(recorded_rests(logs[0].metadata), recorded_rests(log.metadata), log.path)
         return logs
@@ -111,7 +117,6 @@ def read_recordings(
         raise ConfigurationError(
             f"{foreign[0]}: no session log; name the arm's URDF with --urdf to import it"
         )
-    named = () if joints is None else tuple(name.strip() for name in joints.split(","))
     known = Known(named, base, tip, rate_hz, torque, torque_constant, gear_ratio)
     guess = guess_mapping(foreign[0], urdf, known)
     for other in foreign[1:] if guess.mapping.held else ():
@@ -129,7 +134,7 @@ def read_recordings(
     sessions = []
     for path in paths:
         if path not in names:
-            sessions.append(read_recording(path, status=False, motor=torque == "motor"))
+            sessions.append(read(path))
             continue
         target = folder / f"{names[path]}.mcap"
         _clear(target)
@@ -140,7 +145,7 @@ def read_recordings(
 
 def _same_rests(first: Mapping[str, float], other: Mapping[str, float], path: Path) -> None:
     """Refuse recordings with joints at rest elsewhere than in the first: their kinematics differ."""
-    from ident.import_log.guess import RESTING_RAD
+    from ident.import_log.rests import RESTING_RAD
 
     for name in first.keys() | other.keys():
         places = [rests.get(name) for rests in (first, other)]

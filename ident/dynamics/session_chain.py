@@ -37,12 +37,16 @@ def session_chain(
     if rests:
         read = read_urdf(held(read.text, rests))
     whole = _whole_arm(read, session.joint_names, root, end)
-    if whole is not None and session.metadata.get("joints") == AS_RECORDED:
+    recorded = session.metadata.get("joints") == AS_RECORDED
+    if whole is not None and recorded:
         return Chain.from_urdf(read.text, root=root, tip=end, joints=whole)
     try:
         return Chain.from_urdf(read.text, root=root, tip=end, joints=session.joint_names)
     except ConfigurationError:
         if whole is None:
+            if recorded and end is None:
+                # Its error has the arms to choose from.
+                read.arm(names=session.joint_names, root=root)
             raise
         return Chain.from_urdf(read.text, root=root, tip=end, joints=whole)
 

@@ -8,6 +8,7 @@ at zero, as are all joints off the chain; a mimic joint has no coordinate unless
 from __future__ import annotations
 
 import difflib
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -27,6 +28,9 @@ _KINDS = {
     "floating": "fixed",
     "planar": "fixed",
 }
+
+
+_GRIPPER = re.compile("grip|finger|jaw|claw|grasp", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +60,11 @@ class Joint:
     def driven(self) -> bool:
         """Whether the joint has a coordinate of its own."""
         return self.movable and self.mimic is None
+
+    @property
+    def grips(self) -> bool:
+        """Whether the joint is that of a gripper, by its name."""
+        return bool(_GRIPPER.search(f"{self.name} {self.child}"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +140,7 @@ class Urdf:
         A piece begins at the root or a branching and ends at a later branching or a leaf. Any movable joint
         branches, a mimic too, so a gripper with two fingers ends the arm before it.
 
-        count : the only piece with that many joints.
+        count : the only piece with that many joints; or else with as many before those of a gripper, by their names.
         names : the longest unbranched piece with all its joints among them, and the named joints below it.
 
         Raises ConfigurationError, with the pieces, if there is none or more than one.
@@ -144,6 +153,12 @@ class Urdf:
                 pieces[key] = direct or pieces.get(key, False)
         if count is not None:
             found = [piece for piece in pieces if len(piece) == count]
+            grips = {joint.name for joint in self.joints if joint.grips}
+            found = found or [
+                piece[:count]
+                for piece in pieces
+                if len(piece) > count and grips.issuperset(piece[count:]) and piece[count - 1] not in grips
+            ]
             wanted = f"with {count} joints"
         else:
             covered = {piece: direct for piece, direct in pieces.items() if set(piece) <= set(names or ())}
@@ -155,9 +170,33 @@ class Urdf:
         if len(found) != 1:
             choice = "; ".join(f"{len(piece)}: {', '.join(piece)}" for piece in found or pieces)
             raise ConfigurationError(
-                f"robot {self.name!r} has {len(found) or 'no'} serial arms {wanted} ({choice}); name the `joints`"
+                f"robot {self.name!r} has {len(found) or 'no'} serial arms {wanted} ({choice}); name the "
+                "`joints` in a mapping, or with --joints"
             )
         return found[0]
+
+    def beside(
+        self, joints: Collection[str], root: str | None = None, tip: str | None = None
+    ) -> tuple[frozenset[str], frozenset[str]]:
+        """Driven joints that are not of the chain of `joints` and act on it: on its way, and on branches.
+
+        On the way are those between its joints and root, and those on from its end up to a branching; all of these can
+        be joints of the chain. The branches are what else its links carry.
+        """
+        way = self.chain(root, tip, joints)
+        first = next(k for k, joint in enumerate(way) if joint.name in joints)
+        on_way, carried = {joint.name for joint in way}, set[str]()
+        pending = [joint.child for joint in way[first:]]
+        while pending:
+            below = self._below(pending.pop())
+            carried |= {joint.name for joint in below}
+            pending += [joint.child for joint in below if joint.movable and joint.name not in on_way]
+        link = way[-1].child
+        while len(further := [joint for joint in self._below(link) if joint.movable]) == 1:
+            on_way.add(further[0].name)
+            link = further[0].child
+        driven = {joint.name for joint in self.joints if joint.driven} - set(joints)
+        return frozenset(on_way & driven), frozenset((carried - on_way) & driven)
 
     def _pieces(self, root: str | None) -> Iterator[tuple[tuple[Joint, ...], bool]]:
         """Driven joints of each piece, and whether it is without a branching."""

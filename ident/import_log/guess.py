@@ -20,6 +20,7 @@ from ident.import_log.fields import Field, fields
 from ident.import_log.mapping import LogMapping, Signal, TimeBase, Transmission, Unit
 from ident.import_log.rates import ALIKE, Rates, compare
 from ident.import_log.recording import Recording
+from ident.import_log.rests import rests, without_gripper
 from ident.import_log.tables import Floats
 from ident.import_log.turns import unwrapped
 from lwr_driver.configuration import yaml_text
@@ -35,8 +36,6 @@ _LARGEST_CURRENT_A = 200.0
 _UNIX_S = 1e9
 _SLACK = 0.05
 """Share of a joint's range by which positions may exceed it."""
-RESTING_RAD = 1e-2
-"""Largest range of a joint at rest; `identify` counts a joint as moving beyond it."""
 _TURNS = 4.0 * math.pi
 
 
@@ -120,7 +119,6 @@ class _Guesser:
         if position is None:
             raise self._unknown("position")
         joints, why = self._joints(position)
-        rests: dict[str, float] | None = None
         if (
             self.known.joints
             and position.values.shape[1] > len(joints)
@@ -128,13 +126,7 @@ class _Guesser:
         ):
             self._name_columns(position.values.shape[1])
             position = self._best("position") or position
-        picked = position.of(joints)
-        if picked is None:
-            raise DataError(
-                f"{self.source}: {position.shown} has {position.values.shape[1]} columns for the {len(joints)} joints "
-                f"{', '.join(joints)}; name the joints of the columns with --joints"
-            )
-        whole, position = position, picked
+        whole, position = position, self._picked(position, joints)
         bad = np.flatnonzero(~np.isfinite(position.values).all(axis=1))
         if len(bad):
             raise DataError(
@@ -142,9 +134,22 @@ class _Guesser:
                 "write a mapping file and leave them out with `lwr-run import --rows`"
             )
         unit, reason = self._angle_unit(position, joints)
-        if self.known.joints and picked is not whole:
-            rests = self._rests(whole, joints, unit)
-        angle, _ = unwrapped(position.values * (math.pi / 180.0 if unit == "deg" else 1.0))
+        size = math.pi / 180.0 if unit == "deg" else 1.0
+        gripper = False
+        if not self.known.joints and self.known.tip is None:
+            arm = without_gripper(joints, position.values * size, self.robot, self.known.base)
+            if gripper := len(arm) < len(joints):
+                if not set(joints) <= set(position.labels):
+                    self._name_columns(len(joints))
+                whole = replace(position, labels=joints)
+                joints, why = arm, f"{why}, without the gripper at rest"
+                position = self._picked(self._best("position", joints) or whole, joints)
+        held = (
+            self._rests(whole, joints, unit)
+            if (self.known.joints or gripper) and position is not whole
+            else {}
+        )
+        angle, _ = unwrapped(position.values * size)
         velocity = self._finite(self._best("velocity", joints))
         time, times = self._time(angle, velocity, unit)
         rates = None if velocity is None else compare(angle, velocity.values, times)
@@ -170,7 +175,7 @@ class _Guesser:
             joints=joints,
             time=time,
             urdf=str(Path(self.urdf).resolve()),
-            held=rests or None,
+            held=held or None,
             base=self.known.base,
             tip=self.known.tip,
             transmission=Transmission(_each("gear_ratio", self.known.gear_ratio, joints)) if gear else None,
@@ -184,6 +189,16 @@ class _Guesser:
             if one.name not in self.used
         )
         return Guess(self.source, mapping, tuple(self.rows), unused)
+
+    def _picked(self, position: Field, joints: Sequence[str]) -> Field:
+        """The columns of these joints."""
+        picked = position.of(joints)
+        if picked is None:
+            raise DataError(
+                f"{self.source}: {position.shown} has {position.values.shape[1]} columns for the {len(joints)} joints "
+                f"{', '.join(joints)}; name the joints of the columns with --joints"
+            )
+        return picked
 
     def _finite(self, velocity: Field | None) -> Field | None:
         """The velocity without missing values, or None with the reason noted."""
@@ -203,22 +218,22 @@ class _Guesser:
         ]
 
     def _rests(self, position: Field, joints: Sequence[str], unit: str) -> dict[str, float]:
-        """Where the recorded joints rest that are no joints of the model, to four digits."""
+        """Where the recorded joints rest that are no joints of the model, noted in the table."""
         size = math.pi / 180.0 if unit == "deg" else 1.0
-        found = {}
-        arm = self.robot.arm(names=position.labels, root=self.known.base)
-        for k, name in enumerate(position.labels):
-            values = position.values[:, k] * size
-            if name in joints or name not in arm:
-                continue
-            if np.ptp(values) > RESTING_RAD:
-                raise DataError(
-                    f"{self.source}: {name} moves by {np.ptp(values):.3g} rad; name it in --joints, which leaves "
-                    "out joints at rest only"
-                )
-            found[name] = round(float(np.mean(values)), 4)
-        self.rows.append(("held", _span(tuple(found)), "rad", "at rest, not in --joints"))
-        return found
+        found = rests(
+            self.source,
+            position.labels,
+            position.values * size,
+            joints,
+            self.robot,
+            self.known.base,
+            self.known.tip,
+        )
+        still = tuple(name for name in found.held if name not in found.moving)
+        for names, why in ((still, "at rest"), (found.moving, "moves, held at its mean")):
+            if names:
+                self.rows.append(("held", _span(names), "rad", f"{why}, no joint of the model"))
+        return found.held
 
     def _take(
         self, quantity: str, field: Field, unit: str, why: str, constant: tuple[float, ...] = ()
@@ -260,8 +275,9 @@ class _Guesser:
             return tuple(joint.name for joint in way if joint.driven), f"driven joints up to {self.known.tip}"
         if all(position.labels) and not any(label.isdigit() for label in position.labels):
             try:
-                self.robot.chain(root, None, position.labels)
-                return position.labels, "named in the columns"
+                way = self.robot.chain(root, None, position.labels)
+                named = tuple(joint.name for joint in way if joint.name in position.labels)
+                return named, "named in the columns"
             except ConfigurationError:
                 return self.robot.arm(names=position.labels, root=root), "the arm named in the columns"
         count = position.values.shape[1]
@@ -426,11 +442,14 @@ class _Guesser:
             names=[joint.name for joint in self.robot.joints if joint.driven]
         )
         width, count = table.values.shape[1], len(names)
+        grips = {joint.name for joint in self.robot.joints if joint.grips}
+        while not self.known.joints and count > 1 and names[count - 1] in grips and width % count > 1:
+            count -= 1
         start = width % count
         if start > 1 or width < 2 * count:
             raise DataError(
-                f"{self.source}: {width} columns without names are no positions and torques of {count} joints; write a "
-                "mapping file for `lwr-run import`, or name the columns in a first row"
+                f"{self.source}: {width} columns without names are no positions and torques of {count} joints; name "
+                "the joints with --joints, or write a mapping file for `lwr-run import`, or name columns in a first row"
             )
         parts = [
             replace(

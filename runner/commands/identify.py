@@ -177,7 +177,7 @@ def command(
     else:
         found = identify(logs, chain, wanted)
     result = named_model(
-        found.essential_model if essential else found.model, logs[0].metadata.get("robot", "arm")
+        found.essential_model if essential else found.model, logs[0].metadata.get("robot", "") or "arm"
     )
     content, tables = found.to_dict(), found.pieces()
     if mounting is not None:

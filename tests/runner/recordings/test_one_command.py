@@ -193,6 +193,21 @@ def test_the_effort_of_a_bag_may_be_the_motors(lab: Path) -> None:
     assert "names its joints and quantities" in refused.output
 
 
+def test_two_bags_of_one_arm_and_the_joints_of_a_bag(lab: Path) -> None:
+    words = ("identify", lab / "one.mcap", lab / "two.mcap", "--urdf", lab / "arm.urdf", "--model", "1")
+    done = run(*words, "--joints", ",".join(JOINTS), "--out", lab / "both.yaml")
+    assert done.exit_code == 0, done.output
+    assert read_model(lab / "both.yaml").structure.chain.joint_names == JOINTS
+    refused = run(*words, "--joints", ",".join(JOINTS[:6]))
+    assert "panda_joint7 moves by" in refused.output
+    assert "name it in --joints" in refused.output
+
+
+def test_the_joints_of_a_session_log_are_those_of_its_import(first: Result, lab: Path) -> None:
+    refused = run("identify", lab / "first" / "one.mcap", "--joints", ",".join(JOINTS))
+    assert "were chosen at its import" in refused.output
+
+
 def test_a_folder_with_a_split_bag_is_one_recording(lab: Path, tmp_path: Path) -> None:
     from ident.import_log import read_recording
 
