@@ -196,4 +196,45 @@ BUGS: tuple[Bug, ...] = (
         "        found += [*_both_sides(session)]\n",
         ("tests/ident/screening/test_screen.py::test_a_torque_that_is_a_copy_of_another_joints_is_an_error",),
     ),
+    Bug(
+        "rows are built across a jump of a position",
+        "ident/rows/prepare.py",
+        "longest_bridge_s, jumps)",
+        "longest_bridge_s)",
+        ("tests/ident/rows/test_prepare.py::test_no_row_is_built_across_a_jump_of_a_position",),
+    ),
+    Bug(
+        "an angle that wraps stays so at import",
+        "ident/import_log/conversion.py",
+        "        values, wraps = unwrapped(values)\n",
+        "        pass\n",
+        (
+            "tests/ident/import_log/test_import_log.py::"
+            "test_an_angle_that_wraps_is_unwrapped_and_a_jump_is_told",
+        ),
+    ),
+    Bug(
+        "a few bad samples decide whether a velocity is dq/dt",
+        "ident/import_log/rates.py",
+        "    kept = left <= np.quantile(left, 1.0 - _WORST)\n",
+        "    kept = left <= np.inf\n",
+        ("tests/ident/import_log/test_guess.py::test_velocities_stay_beside_a_hole_a_jump_and_a_wrap",),
+    ),
+    Bug(
+        "a motor torque that is a copy of the joint torque is not named",
+        "ident/screening/channels.py",
+        "        found += [*_copied(session), *_both_sides(session)]\n",
+        "        found += [*_copied(session)]\n",
+        (
+            "tests/ident/screening/test_screen.py::"
+            "test_motor_torques_that_are_a_copy_of_the_joint_torques_are_named",
+        ),
+    ),
+    Bug(
+        "each bag is a robot of its own, by the name of its file",
+        "ident/import_log/direct.py",
+        '"" if robot is None else robot.name',
+        "source.stem",
+        ("tests/ident/import_log/test_rests.py::test_a_bag_has_the_name_of_its_description_or_none",),
+    ),
 )
