@@ -539,6 +539,10 @@ def _velocity(session: Session) -> Iterator[Doubt]:
         sums[ends + 1] - sums[places[:-1]] - 0.5 * (joint.velocity[ends] + joint.velocity[places[:-1]])
     ) / size
     slope = np.diff(joint.position[places], axis=0) / np.diff(time[places])[:, None]
+    # A position that jumps says nothing of the speed.
+    behind = np.array([jump.behind for jump in position_jumps(joint)], dtype=np.int64)
+    whole = np.diff(np.searchsorted(behind, places, side="right")) == 0
+    inner, slope = inner[whole], slope[whole]
     if not np.isfinite(inner).all():
         return
     moved = np.ptp(joint.position, axis=0) > _MOVED

@@ -530,6 +530,10 @@ def test_a_position_that_jumps_is_told_with_time_size_and_advice(pair: list[Sess
     (missing,) = check_channels([jumping(jumping(bare, 2, 0.4), 3, -0.1)], chain())
     assert missing.joints == bare.joint_names[2:4]
     assert missing.looks_like == "samples missing without a gap in the stamps"
+    # The velocities are as good as before.
+    with_speeds = with_speed()([bare])[0]
+    (turn, *more) = check_channels([jumping(with_speeds, 4, -2.0 * np.pi)], chain())
+    assert (turn.channel, more) == ("position", [])
 
 
 def test_velocities_off_by_some_per_cent_in_all_joints_alike_are_told(pair: list[Session]) -> None:
