@@ -130,7 +130,7 @@ def of_estimate(content: Mapping[str, Any], model: Path | None, tables: Sequence
     """The end of an estimate without a folder of results. content : of `Identification.to_dict`."""
     names = [one["name"] for one in content["sessions"]]
     sentence = f"Model {content['model']} estimated from {len(names)} session{'s' * (len(names) > 1)}."
-    warnings = content.get("warnings") or ()
+    warnings = (*(content.get("warnings") or ()), *content.get("validation_warnings", ()))
     advice = ["`--verbose` shows every table, `--results FOLDER` writes a report."]
     next_step = "" if model is None else f"lwr-run validate {quote(str(model))} HELD_OUT.mcap"
     look = [Verdict("warning", text, "", "look") for text in warnings]

@@ -33,6 +33,9 @@ from ident.screening.screen import require_sound, screen
 from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
 
+# Torque error on held-out data from which a model is of no use there.
+_POOR = 0.2
+
 
 @dataclass(frozen=True)
 class Unscored:
@@ -198,8 +201,22 @@ def validate(
         named = ", ".join(dict.fromkeys(str(effect["cause"]) for effect in model.effects))
         notes = (f"The torque has the effects of the model: {named}.",)
     warnings = settle([doubt for doubt in doubts if not doubt.certain])
+    warnings += [text for score in scores if not score.seen and (text := _poor(score))]
     return Validation(
         model.robot, tuple(scores), notes=notes, unscored=tuple(unscored), warnings=tuple(warnings)
+    )
+
+
+def _poor(score: SessionScore) -> str:
+    """What to say of a session whose torque the model does not predict; empty where it does."""
+    side, error = max(score.relative.items(), key=lambda item: item[1])
+    if error < _POOR:
+        return ""
+    worst = max((one for one in score.scores if one.side == side), key=lambda one: one.rms)
+    return (
+        f"{score.session}: the {side} torque is off by {100.0 * error:.0f} %, most at {worst.joint} "
+        f"({worst.rms:.3g} Nm rms): the model does not hold there; another payload, a wrong channel, or a motion "
+        "beyond that of the estimate"
     )
 
 

@@ -195,6 +195,7 @@ def command(
     if validation is not None:
         whole = validation.to_dict()
         content |= {"validation": whole["sessions"], "unscored": whole["unscored"]}
+        content["validation_warnings"] = whole["warnings"]
         tables += ["", *validation.pieces()]
     page = None
     if results is not None:

@@ -59,6 +59,16 @@ def test_the_loaded_session_is_predicted_with_its_payload(truth_model: Any, load
     )
 
 
+def test_a_recording_that_the_model_does_not_predict_is_a_warning(truth_model: Any, unloaded: Any) -> None:
+    assert not validate(truth_model, [unloaded], settings=PLAIN).warnings
+    values = truth_model.values.copy()
+    values[truth_model.names.index("offl3")] += 30.0
+    shifted = replace(truth_model, values=values)
+    (told,) = validate(shifted, [unloaded], settings=PLAIN).warnings
+    assert told.startswith("unloaded.mcap: the joint torque is off by")
+    assert "most at E1 (30 Nm rms): the model does not hold there" in told
+
+
 def test_errors_of_the_model_are_found_where_they_are(truth_model: Any, bench: Any, unloaded: Any) -> None:
     values = truth_model.values.copy()
     values[truth_model.names.index("offl3")] += 0.5
