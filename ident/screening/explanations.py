@@ -114,7 +114,7 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
     tried = [one for one in tried if believed(one, len(normal.classes))]
     # Of the session as a whole before its half.
     best = max(tried, key=lambda one: one.drop - _FINER * (len(one.parts) == 1), default=None)
-    return None if best is None else _refined(best, before)
+    return None if best is None else _refined(best, before, normal)
 
 
 def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:
@@ -286,8 +286,31 @@ def _labels(data: Redundancy) -> Iterator[Explanation]:
             yield Explanation("payload", (), looks, replace(data, rows=rows), label=str(record))
 
 
-def _refined(candidate: Explanation, before: float) -> Explanation:
-    """The gain of a position or the pace of time by steps around the coarse value, each half the last."""
+def _measured_again(candidate: Explanation, before: float, normal: Normal) -> Explanation:
+    """The gain of a torque from the mended data: the wrong channel had bent the bodies that it was measured against."""
+    (joint,), data = candidate.joints, candidate.mended
+    side = candidate.channel.removesuffix(" torque")
+    fit = data.fit(normal, doubtful=False)
+    more = data.gains(fit, normal)[side, joint].value
+    assert candidate.gain is not None
+    scale = np.eye(data.chain.n)
+    scale[joint, joint] = 1.0 / more if more > 0.0 else 1.0
+    mended = data.mapped(side, scale)
+    drop = before - mended.fit(normal, doubtful=False).score
+    if drop <= candidate.drop:
+        return candidate
+    factor = candidate.factor * more
+    gain = replace(candidate.gain, value=factor, std=candidate.gain.std * more)
+    named = candidate.looks_like == unit_of(candidate.factor)
+    looks_like = unit_of(factor) if named else candidate.looks_like
+    return replace(candidate, factor=factor, gain=gain, looks_like=looks_like, mended=mended, drop=drop)
+
+
+def _refined(candidate: Explanation, before: float, normal: Normal) -> Explanation:
+    """A gain of a torque measured again; that of a position or the pace of time by steps around the coarse value, each
+    half the last."""
+    if candidate.gain is not None and len(candidate.joints) == 1:
+        return _measured_again(candidate, before, normal)
     if abs(candidate.factor) == 1.0 or candidate.channel not in ("position", "time"):
         return candidate
     best, step = candidate, 0.2
