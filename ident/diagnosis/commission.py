@@ -40,6 +40,7 @@ from ident.estimation.turning import drive_coulomb
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.content import Recall
+from ident.rows.delay import Delay
 from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -237,14 +238,15 @@ def commission(
     for side in sides:
         arm_of_side = replace(start, encoder=side)
         told[side] = channel_delays(parts[0], arm_of_side, settings)
-        tuned[side] = _tuned(arm_of_side, first, slow, 2, told[side])
+        tuned[side] = _tuned(arm_of_side, first, slow, 2, common_delays([told[side]]))
     side = min(sides, key=lambda one: tuned[one].misfit)
     log.info("positions of the %s", side)
-    one = _tuned(tuned[side].arm, first, settings, _ROUNDS, told[side])
-    several, late, base = [one.arm], [told[side]], one.base
-    for part, recordings in zip(parts[1:_TUNING_SETS], recorded[1:_TUNING_SETS], strict=True):
-        late.append(channel_delays(part, one.arm, settings))
-        several.append(_tuned(one.arm, recordings, settings, 1, late[-1]).arm)
+    further = [channel_delays(part, tuned[side].arm, settings) for part in parts[1:_TUNING_SETS]]
+    late = common_delays([told[side], *further])
+    one = _tuned(tuned[side].arm, first, settings, _ROUNDS, late)
+    several, base = [one.arm], one.base
+    for recordings in recorded[1:_TUNING_SETS]:
+        several.append(_tuned(one.arm, recordings, settings, 1, late).arm)
     known = _middle(several)
     days = [_day(known, recordings, settings, base) for recordings in recorded]
     known = with_far_presliding(known, [day.slow_turns for day in days], [day.coulomb for day in days])
@@ -254,7 +256,7 @@ def commission(
         open_s = {
             side: float(np.mean([day.late[side][0] for day in days]))
             for side in _CHANNELS
-            if not all(side in one for one in late)
+            if side not in late
         }
         known = _later(known, open_s)
     known = replace(known, healthy=character(known, recorded, settings))
@@ -343,9 +345,9 @@ def _later(arm: NominalArm, by: Mapping[str, float]) -> NominalArm:
 
 def channel_delays(
     sessions: Sequence[Session], arm: NominalArm, settings: DiagnosisSettings
-) -> dict[str, float]:
-    """Delays of the channels [s] as `identify` finds them: from rows away from reversals, where presliding, which
-    looks like a delay, has no part. Without those that the rows do not tell.
+) -> dict[str, list[Delay]]:
+    """Delays of the channels as `identify` finds them: from rows away from reversals, where presliding, which looks
+    like a delay, has no part. Without those that the rows do not tell.
     """
     springs = None
     if arm.encoder == "link" and np.any(arm.compliance > 0.0):
@@ -365,17 +367,25 @@ def channel_delays(
         log.info("no delays from rows away from reversals: %s", error)
         return {}
     delays = {"motor": [one.delay for one in prepared], "joint": [one.joint_delay for one in prepared]}
-    told = {
-        side: [(one.estimate, one.std) for one in own if one is not None and one.by_joint and one.std > 0.0]
+    return {
+        side: [one for one in own if one is not None and one.by_joint and one.std > 0.0]
         for side, own in delays.items()
     }
-    return {side: _mean(values) for side, values in told.items() if values}
 
 
-def _mean(values: Sequence[tuple[float, float]]) -> float:
-    """Weighted mean of values with standard deviations."""
-    means, stds = np.array(values).T
-    return float(np.average(means, weights=stds**-2.0))
+def common_delays(sets: Sequence[Mapping[str, Sequence[Delay]]]) -> dict[str, float]:
+    """The delay of each channel [s] that the sets tell together, zero where it is none; without the sides that none of
+    them tells."""
+    found = {}
+    for side in _CHANNELS:
+        told = [one for own in sets for one in own.get(side, ())]
+        if told:
+            values, stds = np.array([(one.estimate, one.std) for one in told]).T
+            weights = stds**-2.0
+            mean = float(np.average(values, weights=weights))
+            earliest = min(one.earliest for one in told)
+            found[side] = Delay.of(mean, float(weights.sum() ** -0.5), "", {}, 1.0, earliest).seconds
+    return found
 
 
 def _middle(arms: Sequence[NominalArm]) -> NominalArm:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ident.diagnosis.candidates import Candidate, Trial
-from ident.diagnosis.commission import compliance_std, delay_std, gain_std, with_far_presliding
+from ident.diagnosis.commission import common_delays, compliance_std, delay_std, gain_std, with_far_presliding
 from ident.diagnosis.evidence import Score
 from ident.diagnosis.nominal import GAIN_STD, NominalArm
 from ident.diagnosis.reference import DELAY_STD_S, Reference
@@ -21,6 +21,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, ModelStructure
 from ident.effects import EFFECTS, Shape
 from ident.model import DynamicModel
+from ident.rows.delay import Delay
 
 
 def reference(model: DynamicModel, null: dict[tuple[str, int], float], sets: int) -> Reference:
@@ -231,3 +232,17 @@ def test_a_limit_grows_with_the_information_of_the_motion_and_falls_with_none() 
 
 def _score(gain: float, count: int = 1) -> Score:
     return Score(gain, gain, np.ones(count), 1.0, lambda: (np.eye(count), 40))
+
+
+def test_a_delay_that_one_set_does_not_tell_is_that_of_the_others() -> None:
+    def told(seconds: float, std: float, earliest: float = 0.0) -> Delay:
+        return Delay(max(seconds, earliest), std, "told", estimate=seconds, earliest=earliest)
+
+    precise, vague = told(2e-3, 1e-4), told(9e-3, 5e-3)
+    assert common_delays([{"motor": []}, {"motor": [precise]}]) == {"motor": 2e-3}
+    assert common_delays([{"motor": [vague]}, {"motor": [precise]}])["motor"] == pytest.approx(2e-3, abs=1e-5)
+    # Not told from none, or before the motion, as no channel is unless the positions are late.
+    assert common_delays([{"motor": [vague]}]) == {"motor": 0.0}
+    assert common_delays([{"motor": [told(-7e-3, 1e-3)]}]) == {"motor": 0.0}
+    assert common_delays([{"joint": [told(-7e-3, 1e-3, -np.inf)]}]) == {"joint": -7e-3}
+    assert common_delays([{"motor": [], "joint": []}]) == {}
