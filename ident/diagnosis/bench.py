@@ -26,9 +26,14 @@ _BySide = dict[str, Floats]
 _SLOW_S = 0.1
 # Sides of the parameters of friction in units of torque.
 _BORNE: dict[str, Side] = {"Fcl": "joint", "offl": "joint", "Fcm": "motor", "offm": "motor"}
-# Relative standard deviation of a stiffness from the literature, and largest relative change in a step.
-_UNSURE, _LARGEST_STEP = 0.5, 0.35
+# Largest relative change of a compliance in a step.
+_LARGEST_STEP = 0.35
 _FACTORS = (0.5, 0.7, 1.0, 1.4)
+
+STATED_WITHIN = 2.0
+"""Factor within which a stiffness of the arm's description is known."""
+UNSURE = 0.5
+"""Relative standard deviation of such a compliance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +75,11 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             far=reference.far,
             far_share=reference.far_share,
             gain_std=reference.gain_std,
+            compliance_std=reference.compliance_std,
             couplings=data.couplings,
             healthy=tuple(e for e in reference.model.effects if e["cause"] != PRESLIDING.cause),
         )
-    return NominalArm(chain, compliance, ratio, couplings=data.couplings)
+    return NominalArm(chain, compliance, ratio, couplings=data.couplings, stated=compliance)
 
 
 def some_joint_moves(recordings: Sequence[SessionRecord]) -> None:
@@ -106,7 +112,9 @@ def prepare_bench(
     fit_compliance: bool,
 ) -> DiagnosisBench:
     """Rows, noise and evidence of the nominal arm, its stiffness fitted where nothing better is known."""
-    if fit_compliance and arm.encoder == "motor" and np.any(arm.compliance > 0.0):
+    # A fitted arm is near enough, and scaled again in each round it would lose the description.
+    as_described = np.any(arm.compliance > 0.0) and np.array_equal(arm.compliance, arm.anchor)
+    if fit_compliance and arm.encoder == "motor" and as_described:
         arm = _roughly_stiff(arm, recordings, settings, reference)
     structure, base = structure_of(arm, recordings)
     nominal = Nominal(arm, recordings, settings, structure, base)
@@ -198,7 +206,7 @@ def _roughly_stiff(
     reference: Reference | None,
 ) -> NominalArm:
     """The arm with its compliance times the factor of the best fit, as a start near enough for derivatives."""
-    tried = [replace(arm, compliance=factor * arm.compliance) for factor in _FACTORS]
+    tried = [replace(arm, compliance=factor * arm.compliance, stated=arm.anchor) for factor in _FACTORS]
     misfits = [
         prepare_bench(one, recordings, settings, reference, (), fit_compliance=False).evidence.chi_square
         for one in tried
@@ -219,13 +227,13 @@ def _compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalArm) -> F
         j = candidate.joint
         value, std = float(score.coefficients[0]), float(np.sqrt(score.covariance[0, 0]))
         if abs(value) > 3.0 * std:
-            step[j] = np.clip(here[j] + value, 0.0, 3.0 * arm.compliance[j]) - here[j]
+            step[j] = np.clip(here[j] + value, 0.0, 3.0 * arm.anchor[j]) - here[j]
     return step
 
 
 def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalArm) -> Floats:
-    """Step (n,) of all joints' compliance beside the channels' delays, at most a third of each. The description's
-    stiffness, known to a factor of about two, decides only where a joint hardly bends."""
+    """Step (n,) of all joints' compliance beside the channels' delays, at most a third of each and within a factor
+    `STATED_WITHIN` of the description's, which decides where a joint hardly bends."""
     here, step = nominal.arm.compliance, np.zeros(nominal.arm.chain.n)
     dictionary = Dictionary(nominal, evidence, [e.cause for e in (ELASTICITY, *DELAYS.values())])
     bent = [c for c in dictionary.candidates if c.joint >= 0 and here[c.joint] > 0.0]
@@ -237,11 +245,15 @@ def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalAr
     change, covariance = evidence.full.values[place:], evidence.covariance()[place:, place:]
     evidence.replace(kept)
     joints = [c.joint for c in bent]
-    precision = np.diag((_UNSURE * arm.compliance[joints]) ** -2.0)
+    stated = arm.anchor[joints]
+    precision = np.diag((UNSURE * stated) ** -2.0)
     information = np.linalg.inv(covariance + np.diag(1e-12 * np.diag(covariance) + 1e-30))
-    pull = information @ change + precision @ (arm.compliance[joints] - here[joints])
+    pull = information @ change + precision @ (stated - here[joints])
     found = np.linalg.solve(information + precision, pull)
-    step[joints] = np.clip(found, -_LARGEST_STEP * here[joints], _LARGEST_STEP * here[joints])
+    found = np.clip(found, -_LARGEST_STEP * here[joints], _LARGEST_STEP * here[joints])
+    step[joints] = (
+        np.clip(here[joints] + found, stated / STATED_WITHIN, stated * STATED_WITHIN) - here[joints]
+    )
     return step
 
 

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import (
+    STATED_WITHIN,
+    UNSURE,
     ArmData,
     DiagnosisBench,
     every_joint_moves,
@@ -27,7 +29,15 @@ from ident.diagnosis.evidence import Evidence, Floats, Rows
 from ident.diagnosis.nominal import GAIN_STD, Nominal, NominalArm
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
-from ident.diagnosis.reference import DELAY_STD_S, USUAL_CHANGES, USUAL_DAYS, Reference, habit, shared
+from ident.diagnosis.reference import (
+    DELAY_STD_S,
+    USUAL_CHANGES,
+    USUAL_DAYS,
+    Reference,
+    habit,
+    shared,
+    unsure,
+)
 from ident.diagnosis.selection import gains, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.tolerances import gain_rows
@@ -60,6 +70,8 @@ _TUNING_SETS = 3
 _ROUNDS = 3
 _LATEST_S = 0.02
 _CHANNELS = ("motor", "joint")
+# Share of the factor of a stated stiffness within which a fit is at its end.
+_END = 1.05
 
 SlowTurns = NDArray[np.float64]
 """(2, longer distances, n): slowly reversing Coulomb friction [Nm], and its standard deviation."""
@@ -247,7 +259,7 @@ def commission(
     several, base = [one.arm], one.base
     for recordings in recorded[1:_TUNING_SETS]:
         several.append(_tuned(one.arm, recordings, settings, 1, late).arm)
-    known = _middle(several)
+    known = as_stated(_middle(several), [one.compliance for one in several])
     days = [_day(known, recordings, settings, base) for recordings in recorded]
     known = with_far_presliding(known, [day.slow_turns for day in days], [day.coulomb for day in days])
     for _ in range(_SETTLING):
@@ -284,7 +296,7 @@ def commission(
         model=replace(found.model, provenance=provenance),
         shown=shown,
         usual=usual_sizes(tables),
-        compliance_std=compliance_std([one.compliance for one in several]),
+        compliance_std=known.compliance_std,
     )
 
 
@@ -399,6 +411,26 @@ def _middle(arms: Sequence[NominalArm]) -> NominalArm:
         motor_delay_s=float(np.mean([arm.motor_delay_s for arm in arms])),
         joint_delay_s=float(np.mean([arm.joint_delay_s for arm in arms])),
         presliding=np.where(2 * seen.sum(axis=0) > len(arms), lengths, 0.0),
+    )
+
+
+def as_stated(arm: NominalArm, sets: Sequence[Floats]) -> NominalArm:
+    """The arm with the standard error of its compliance from those of the sets (n,) [rad/Nm], and with the stated one,
+    known to a factor, where encoders at the motors do not tell it: the sets do not agree on one, or end at that factor.
+    """
+    std = compliance_std(sets)
+    if arm.encoder == "link" or arm.stated is None:
+        return replace(arm, compliance_std=std)
+    factors = np.array(sets) / np.maximum(arm.stated, 1e-300)
+    ends = np.any((factors < _END / STATED_WITHIN) | (factors > STATED_WITHIN / _END), axis=0)
+    unknown = (arm.stated > 0.0) & (ends | unsure(arm.compliance, std))
+    own = np.zeros(len(arm.stated)) if std is None else std
+    if std is None and not unknown.any():
+        return arm
+    return replace(
+        arm,
+        compliance=np.where(unknown, arm.stated, arm.compliance),
+        compliance_std=np.where(unknown, UNSURE * arm.stated, own),
     )
 
 

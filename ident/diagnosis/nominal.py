@@ -72,9 +72,10 @@ class NominalArm:
     presliding : (n,) distance after a reversal in which 63 % of the drive's Coulomb friction turn [rad], zero where
     unknown.
     far, far_share : (n,) longer distance [rad] for a share of that friction, and the share.
-    gain_std : of the torque sensors' gains from day to day. couplings : pairs of joints with coupled drives.
-    healthy : entries of the healthy arm's own effects (`ident.effects`); their torque is part of the nominal one, so
-    that a cause is a change against this arm.
+    gain_std : of the torque sensors' gains from day to day. stated : (n,) compliance of the arm's description
+    [rad/Nm], `compliance` by default. compliance_std : (n,) standard error of that of a healthy arm.
+    couplings : pairs of joints with coupled drives. healthy : entries of the healthy arm's own effects
+    (`ident.effects`); their torque is part of the nominal one, so that a cause is a change against this arm.
     """
 
     chain: Chain
@@ -90,6 +91,13 @@ class NominalArm:
     gain_std: float = GAIN_STD
     couplings: tuple[Coupling, ...] = ()
     healthy: tuple[Mapping[str, Any], ...] = ()
+    stated: Floats | None = None
+    compliance_std: Floats | None = None
+
+    @property
+    def anchor(self) -> Floats:
+        """Compliance (n,) [rad/Nm] around which a fit stays."""
+        return self.compliance if self.stated is None else self.stated
 
     @property
     def delays(self) -> dict[str, float]:

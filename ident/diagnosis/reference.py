@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.diagnosis.evidence import Floats
@@ -68,8 +69,9 @@ class Reference:
     the changes from day to day. masses : announced, of its payloads [kg].
     gain_std : of the torque sensors' gains from day to day. compliance_std : (n,) [rad/Nm] standard error of the
     compliance from its scatter over the sets, None for a single one; 0 where no set differs from the first beyond
-    chance. shown : mean information of the sets on each candidate, by shape of its grid: the fall of the chi-square for
-    a unit of its coefficients. usual : size of each candidate on the healthy arm.
+    chance, and half of a stated compliance that the sets do not tell. shown : mean information of the sets on each
+    candidate, by shape of its grid: the fall of the chi-square for a unit of its coefficients. usual : size of each
+    candidate on the healthy arm.
     """
 
     model: DynamicModel
@@ -95,11 +97,9 @@ class Reference:
     @property
     def unknown_stiffness(self) -> tuple[str, ...]:
         """Joints with a stiffness that the sets do not tell within 20 % (95 %); none without a scatter of sets."""
-        if self.compliance_std is None:
-            return ()
-        unsure = 2.0 * self.compliance_std > _STIFFNESS_WITHIN * self.compliance
         names = self.model.structure.chain.joint_names
-        return tuple(name for name, found in zip(names, unsure, strict=True) if found)
+        found = unsure(self.compliance, self.compliance_std)
+        return tuple(name for name, one in zip(names, found, strict=False) if one)
 
     def __repr__(self) -> str:
         joints = self.model.structure.chain.joint_names
@@ -107,13 +107,13 @@ class Reference:
             f"{name} {1.0 / c:.4g}" if c > 0.0 else f"{name} rigid"
             for name, c in zip(joints, self.compliance, strict=False)
         )
-        unsure = ", ".join(self.unknown_stiffness)
+        unknown = ", ".join(self.unknown_stiffness)
         return "\n".join(
             [
                 f"Reference of {self.model.robot}: {len(self.model.names)} parameters, healthy sets: {self.sets}",
                 f"  positions of the {self.encoder} side; delays: motor {1e3 * self.motor_delay_s:.2f} ms, "
                 f"joint {1e3 * self.joint_delay_s:.2f} ms",
-                f"  stiffness [Nm/rad]: {stiff or 'unknown'}{f'; not known within 20 %: {unsure}' if unsure else ''}",
+                f"  stiffness [Nm/rad]: {stiff or 'unknown'}{f'; not known within 20 %: {unknown}' if unknown else ''}",
             ]
         )
 
@@ -301,6 +301,13 @@ class Reference:
             if k not in here:
                 precision[k, k], mean[k] = 1.0 / (WEIGHED * mass) ** 2, mass
         return precision, mean
+
+
+def unsure(compliance: Floats, std: Floats | None) -> NDArray[np.bool_]:
+    """Compliances (n,) with a standard error (n,) of more than 20 % (95 %), none without."""
+    if std is None:
+        return np.zeros(len(compliance), dtype=bool)
+    return np.asarray(2.0 * std > _STIFFNESS_WITHIN * compliance)
 
 
 def habit(

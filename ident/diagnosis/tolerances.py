@@ -32,6 +32,8 @@ from ident.effects.motion import ArmMotion
 _KNOWN_DELAY = 0.4
 # The same for a stiffness behind published motors.
 _KNOWN_COMPLIANCE = 0.4
+# Largest error of a healthy arm's compliance, in standard errors: to a factor of two of a stated one.
+_ERRORS = 2.0
 # Largest factor on a presliding length from day to day, and that of the two lengths of its column.
 _LONGEST, _APART = 5.0, 1.5
 # Largest share of friction that turns, with some room.
@@ -78,10 +80,12 @@ def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSe
         known = nominal.arm.encoder == "motor" and nominal.arm.encoder_known
         share = settings.compliance_tolerance * (_KNOWN_COMPLIANCE if known else 1.0)
         shape = ELASTICITY.at_encoder(nominal.arm.encoder)
+        error = nominal.arm.compliance_std
+        unknown = np.zeros(nominal.arm.chain.n) if error is None else _ERRORS * error
         for joint in range(nominal.arm.chain.n):
             rows = dictionary.rows(Candidate(ELASTICITY, joint), shape)
             if rows:
-                size = share * float(nominal.arm.compliance[joint])
+                size = max(share * float(nominal.arm.compliance[joint]), float(unknown[joint]))
                 found.append(
                     Tolerance(f"{COMPLIANCE} {joint + 1}", rows, 1.0, size, (ELASTICITY.cause, joint))
                 )

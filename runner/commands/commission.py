@@ -235,7 +235,8 @@ def _ending(found: Reference, sets: int, sessions: int, names: tuple[str, ...], 
         )
         look.append(Verdict("few sets", text, "", "look"))
     if unknown := ", ".join(found.unknown_stiffness):
-        text = f"the sets do not tell it within 20 % in {unknown}; more sets, or faster motions"
+        stated = "taken as stated, known within a factor of two; " if found.encoder == "motor" else ""
+        text = f"the sets do not tell it within 20 % in {unknown}; {stated}more sets, or faster motions"
         look.append(Verdict("stiffness unknown", text, "", "look"))
     return Ending(
         "look" if look else "good",

@@ -8,8 +8,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ident.diagnosis import bench
 from ident.diagnosis.candidates import Candidate, Trial
-from ident.diagnosis.commission import common_delays, compliance_std, delay_std, gain_std, with_far_presliding
+from ident.diagnosis.commission import (
+    as_stated,
+    common_delays,
+    compliance_std,
+    delay_std,
+    gain_std,
+    with_far_presliding,
+)
 from ident.diagnosis.evidence import Score
 from ident.diagnosis.nominal import GAIN_STD, NominalArm
 from ident.diagnosis.reference import DELAY_STD_S, Reference
@@ -146,6 +154,43 @@ def test_a_stiffness_that_differs_from_set_to_set_is_unknown(model: DynamicModel
     assert f"not known within 20 %: {names[1]}" in repr(healthy)
     stored = replace(model, provenance=healthy.stored())
     assert Reference.of(stored).unknown_stiffness == (names[1],)
+
+
+def test_a_stiffness_that_the_sets_do_not_tell_is_the_stated_one(arm: NominalArm) -> None:
+    stated = np.full(3, 1e-4)
+    # Agreed on, differing from set to set, and at the end of the factor within which it is stated.
+    sets = [np.array([0.80e-4, 0.6e-4, 0.5e-4]), np.array([0.82e-4, 1.4e-4, 0.5e-4])]
+    behind = replace(arm, compliance=np.mean(sets, axis=0), encoder="motor", stated=stated)
+    found = as_stated(behind, sets)
+    np.testing.assert_allclose(found.compliance, [0.81e-4, 1e-4, 1e-4])
+    assert found.compliance_std is not None
+    np.testing.assert_allclose(found.compliance_std, [0.01e-4, 0.5e-4, 0.5e-4])
+    single = as_stated(replace(behind, compliance=sets[0]), sets[:1])
+    np.testing.assert_allclose(single.compliance, [0.8e-4, 0.6e-4, 1e-4])
+    before = as_stated(replace(behind, encoder="link"), sets)
+    np.testing.assert_array_equal(before.compliance, behind.compliance)
+
+
+def test_rounds_of_a_fit_stay_near_the_stated_stiffness(
+    arm: NominalArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    candidates = [Candidate(EFFECTS["joint_elasticity"], joint) for joint in range(3)]
+    dictionary = SimpleNamespace(candidates=candidates, rows=lambda candidate, shape: {})
+    monkeypatch.setattr(bench, "Dictionary", lambda *given: dictionary)
+    # However sure, the data lead no further than the factor.
+    values, covariance = np.full(3, -1e-3), 1e-14 * np.eye(3)
+    evidence = SimpleNamespace(
+        extra=[],
+        base_count=0,
+        replace=lambda extra: None,
+        full=SimpleNamespace(values=values),
+        covariance=lambda: covariance,
+    )
+    fitted = replace(arm, encoder="motor", compliance=np.full(3, 1e-4), stated=np.full(3, 1e-4))
+    for _ in range(9):
+        step = bench._compliance_step(SimpleNamespace(arm=fitted), evidence, fitted)
+        fitted = replace(fitted, compliance=fitted.compliance + step)
+    np.testing.assert_allclose(fitted.compliance, 0.5e-4)
 
 
 def test_one_set_says_nothing_of_its_stiffness(model: DynamicModel) -> None:

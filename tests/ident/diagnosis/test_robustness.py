@@ -11,7 +11,9 @@ import pytest
 
 from fri.errors import DataError
 from ident.diagnosis import Diagnosis, DiagnosisSettings, diagnose
+from ident.diagnosis.candidates import Dictionary
 from ident.diagnosis.signatures import signature_bench
+from ident.diagnosis.tolerances import tolerances
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
 from ident.rows.filters import low_pass
@@ -194,6 +196,22 @@ def test_of_a_long_session_windows_from_beginning_to_end_are_used() -> None:
     assert time[0] < 5.0
     assert time[-1] > 75.0
     assert found.claims[0].cause == "cable_spring"
+
+
+def test_a_compliance_is_tolerated_within_what_is_unknown_of_it() -> None:
+    bench = signature_bench([session()], arm())
+    bench.nominal.arm = replace(
+        bench.nominal.arm,
+        encoder="motor",
+        encoder_known=True,
+        compliance=np.full(2, 1e-4),
+        compliance_std=np.array([0.5e-4, 1e-7]),
+    )
+    dictionary = Dictionary(bench.nominal, bench.evidence, ["joint_elasticity"])
+    found = {one.name: one.size for one in tolerances(dictionary, bench.evidence, DiagnosisSettings())}
+    # A stated stiffness to a factor of two, and one learned from healthy sets to a usual share.
+    assert found["compliance 1"] == pytest.approx(1e-4)
+    assert found["compliance 2"] == pytest.approx(0.12e-4)
 
 
 def test_a_fit_of_no_possible_arm_leaves_links_that_move_on_springs() -> None:
