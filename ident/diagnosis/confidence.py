@@ -34,9 +34,9 @@ class Grounds:
     held_out : middle of the fall of the held-out chi-square, in half-widths of its 95 % interval; 0 if untested.
     untested : 1 where held-out rows cannot tell (a change between sessions, an event, too little excitation).
     felt : share of the held-out error of its rows that the claim takes away. one_block : 1 if one block shows all of
-    it. worse : 1 if another row becomes worse beyond chance. rest : unexplained gain in its rows over its own.
-    replaceable : share of its gain explained by unnamed functions of the motion. habitual : 1 for a cause that healthy
-    drives have. company : number of claims of more gain.
+    it. worse : 1 if a row becomes worse beyond chance, see `held_out.worse_rows`. rest : unexplained gain in its rows
+    over its own. replaceable : share of its gain explained by unnamed functions of the motion. habitual : 1 for a cause
+    that healthy drives have. company : number of claims of more gain.
     """
 
     gain: float

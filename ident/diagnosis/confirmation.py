@@ -192,6 +192,7 @@ def _grounds(
     before = max(shown.test_rms_before, 1e-12)
     # What the samples themselves show needs no significance by blocks.
     p_value = 0.0 if effect.seen_in_samples(claim.trial.shape) else shown.p_value
+    acting = {key for key, columns in claim.trial.rows.items() if np.any(columns)}
     return Grounds(
         gain=math.log(max(claim.gain / least, 1e-3)),
         significance=-math.log10(max(p_value, 1e-300)),
@@ -200,7 +201,7 @@ def _grounds(
         untested=float(untested),
         felt=0.0 if untested else 1.0 - shown.test_rms_after / before,
         one_block=float(not untested and not spread_out(without, after, list(claim.trial.rows))),
-        worse=float(not untested and bool(worse_rows(without, after, seed))),
+        worse=float(not untested and bool(worse_rows(without, after, seed, acting))),
         habitual=float(effect.character),
         company=float(sum(other.gain > claim.gain for other in claims)),
     )

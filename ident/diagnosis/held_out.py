@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,9 +90,15 @@ def spread_out(before: HeldOut, after: HeldOut, keys: Sequence[Key]) -> bool:
     return bool(fall.sum() > max(float(fall.max()), 0.0))
 
 
-def worse_rows(before: HeldOut, after: HeldOut, seed: int) -> list[Key]:
+def worse_rows(
+    before: HeldOut, after: HeldOut, seed: int, acting: Collection[Key] | None = None
+) -> list[Key]:
     """Sides and joints with a larger error after than before: by 5 %, or by 1 % and beyond chance for the worst of all
-    rows, once in twenty."""
+    rows, once in twenty.
+
+    acting : rows on which the cause in question acts, default all. The others change with the shared base parameters
+    alone, and count where the error is both larger by 5 % and beyond chance.
+    """
     keys = [
         (side, joint)
         for side, values in before.residual.items()
@@ -101,11 +107,12 @@ def worse_rows(before: HeldOut, after: HeldOut, seed: int) -> list[Key]:
     ]
     tail = 0.025 / max(len(keys), 1)
     found = {key: interval(before, after, [key], seed, tail=tail) for key in keys}
-    return [
-        key
-        for key, (a, b, _, high) in found.items()
-        if b > (1.0 + (FELT_WORSE if high < 0.0 else _MUCH_WORSE)) * a
-    ]
+    worse = []
+    for key, (a, b, _, high) in found.items():
+        sure, acts = high < 0.0, acting is None or key in acting
+        if (sure or acts) and b > (1.0 + (FELT_WORSE if sure and acts else _MUCH_WORSE)) * a:
+            worse.append(key)
+    return worse
 
 
 def _by_block(before: HeldOut, after: HeldOut, weights: Mapping[Key, float]) -> Floats:
