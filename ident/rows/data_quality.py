@@ -22,7 +22,11 @@ _LEAST_AMISS, _SHARE = 3, 0.0005
 _JOLT, _STEPS = 16.0, 4.0
 # Least age of a stale sample in sample times, and largest share of its displacement across the motion.
 _AGE, _ACROSS = 0.15, 0.5
-# Distance in samples of a jolt from a repeated sample.
+# Least share of steps of one period in an even clock, and largest error of a step there, in periods.
+_EVEN, _OFF_CLOCK = 0.9, 0.2
+# Shortest pause of a recording.
+_PAUSE_S = 1.0
+# Distance in samples of a jolt from a repeated sample or a gap.
 _NEAR = 4
 # Count of one value beyond chance in a noisy channel, also over the counts of the next values; a coarse channel
 # stays at its largest value about twice as long as at the next.
@@ -128,23 +132,40 @@ def stale(columns: JointColumns) -> Flags:
     Either all joints repeat their last torques and positions, or most moving joints jolt at once, like positions a
     part of a sample old. A few such samples are no finding, but derivatives of the positions are wrong there.
     """
-    stamps = columns.publish_time if np.ptp(columns.publish_time) > 0 else columns.log_time
-    steps = np.diff(stamps, prepend=stamps[:1])
-    # Positions jolt beside a lost sample, too.
-    gap = (
-        np.abs(steps[1:] - np.median(steps[1:])) > 0.5 * np.median(steps[1:])
-        if len(steps) > 2
-        else np.zeros(0, bool)
-    )
-    beside = (
-        binary_dilation(np.concatenate([[False], gap]), iterations=_NEAR)
-        if len(gap)
-        else np.zeros(len(steps), bool)
-    )
-    old = _jolts(columns.position) & ~beside
+    old = _jolts(columns.position) & ~_beside_gaps(columns)
     if _repeated(columns.effort):
         old |= _same(columns.effort) & _same(columns.position)
     return old
+
+
+def _periods(columns: JointColumns) -> Floats:
+    """Times between samples (N - 1,) over their median, by the clock of the source, else of the host."""
+    stamps = columns.publish_time if np.ptp(columns.publish_time) > 0 else columns.log_time
+    steps = np.diff(stamps).astype(np.float64)
+    return steps / max(float(np.median(steps)), 1.0) if len(steps) else steps
+
+
+def _beside_gaps(columns: JointColumns) -> Flags:
+    """Samples (N,) near a lost one, where positions jolt, too."""
+    gap = np.zeros(len(columns), dtype=bool)
+    gap[1:] = np.abs(_periods(columns) - 1.0) > 0.5
+    return np.asarray(binary_dilation(gap, iterations=_NEAR)) if len(gap) > 2 else np.zeros(len(gap), bool)
+
+
+def _lost(columns: JointColumns) -> int:
+    """Number of lost samples by the counter of the source, without one by the gaps of an otherwise even clock.
+
+    A gap of lost samples is a whole number of periods; a longer one is a pause of the recording.
+    """
+    if columns.numbered:
+        return columns.lost
+    steps = _periods(columns)
+    whole = np.rint(steps)
+    on_clock = np.abs(steps - whole) < _OFF_CLOCK
+    if not len(steps) or np.mean(on_clock & (whole == 1.0)) < _EVEN:
+        return 0
+    missing = on_clock & (whole > 1.0) & (steps * columns.period_s < _PAUSE_S)
+    return int(np.sum(whole[missing] - 1.0))
 
 
 def held(effort: Floats, times: Floats, path_times: Floats, path: Floats) -> Flags:
@@ -400,12 +421,12 @@ def _behind(position: Floats, moves: Flags) -> Flags:
 
 
 def _channel(session: str, channel: str, columns: JointColumns) -> SampleLoss:
-    repeated, jolts = _repeated(columns.effort), _jolts(columns.position)
+    repeated, jolts = _repeated(columns.effort), _jolts(columns.position) & ~_beside_gaps(columns)
     if repeated:
         # A repeated sample and the one after it jolt, too.
         jolts &= ~binary_dilation(_same(columns.effort), iterations=_NEAR)
     stale = int(np.count_nonzero(jolts[1:] & ~jolts[:-1])) if len(jolts) else 0
-    return SampleLoss(session, channel, columns.lost, repeated, stale, len(columns))
+    return SampleLoss(session, channel, _lost(columns), repeated, stale, len(columns))
 
 
 def _same(effort: Floats) -> Flags:

@@ -51,6 +51,27 @@ def session(joint: JointColumns, motor: JointColumns | None = None) -> Session:
     return Session(Path("run.mcap"), {}, {}, joint.names, joint, motor, None, ())
 
 
+def test_without_a_counter_samples_missing_in_an_even_clock_are_lost():
+    kept = np.ones(COUNT, dtype=bool)
+    for row, lost in ((300, 1), (700, 4), (1100, 9)):
+        kept[row : row + lost] = False
+    whole = columns(noisy(), sequence=np.zeros(COUNT, dtype=np.int64))
+
+    def left(kept: np.ndarray, stamps: np.ndarray = whole.publish_time) -> JointColumns:
+        fields = ("sequence", "position", "velocity", "effort")
+        values = {name: getattr(whole, name)[kept] for name in fields}
+        return replace(whole, log_time=stamps[kept] + 10**15, publish_time=stamps[kept], **values)
+
+    (loss,) = sample_loss([session(left(kept))])
+    # Positions jolt beside a gap, too, and are not stale.
+    assert (loss.lost, loss.repeated, loss.stale, loss.samples) == (14, 0, 0, COUNT - 14)
+    # A pause of the recording loses nothing, and a clock without a period tells of no loss.
+    pause = np.ones(COUNT, dtype=bool)
+    pause[500:1000] = False
+    uneven = np.cumsum(np.random.default_rng(1).uniform(0.5, 3.0, COUNT) / RATE * 1e9).astype(np.int64)
+    assert sample_loss([session(left(pause)), session(left(pause | True, uneven))]) == ()
+
+
 def test_a_loss_is_counted_by_kind_with_session_and_channel():
     effort = noisy()
     position = columns(effort).position.copy()
