@@ -17,6 +17,7 @@ from ident.diagnosis.reference import DELAY_STD_S
 from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.selection import Claim
 from ident.diagnosis.task import State, Task
+from ident.diagnosis.tolerances import usual_change
 from ident.effects import LOST_SAMPLES, SENSOR_SATURATION
 from ident.rows.data_quality import SampleLoss
 
@@ -62,7 +63,7 @@ def _parameters(trial: Trial, bench: DiagnosisBench) -> dict[str, Value]:
     """Values with standard deviations, see `intervals`.
 
     Friction near standstill is estimated beside all ways of reversing, beyond its law; the change of the values is
-    part of the uncertainty.
+    part of the uncertainty. So is the usual change of a scale from the day of a reference.
     """
     effect, evidence = trial.candidate.effect, bench.evidence
     values, deviations = estimated(bench.dictionary, evidence, trial)
@@ -76,6 +77,11 @@ def _parameters(trial: Trial, bench: DiagnosisBench) -> dict[str, Value]:
             values, own = estimated(bench.dictionary, evidence, bench.dictionary.refine(beside))
             deviations = {name: float(np.hypot(own[name], values[name] - alone[name])) for name in own}
         evidence.replace(kept)
+    change = usual_change(effect, bench.nominal.arm) if evidence.compared else 0.0
+    if change:
+        # The scale of a healthy arm differs from that of its reference.
+        scale = effect.linear[0].name
+        deviations[scale] = float(np.hypot(deviations[scale], change))
     return {
         p.name: Value(values[p.name], deviations[p.name], p.unit)
         for p in effect.parameters

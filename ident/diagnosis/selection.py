@@ -18,7 +18,7 @@ from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Floats, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.diagnosis.tolerances import HABITUAL, LENGTH, Tolerance, tolerances
+from ident.diagnosis.tolerances import HABITUAL, LENGTH, Tolerance, tolerances, usual_change
 from ident.diagnosis.usual_sizes import Healthy
 from ident.effects import Shape
 from ident.estimators.estimate import normal_tail
@@ -339,9 +339,9 @@ class State:
     def _scaled(self, candidate: Candidate) -> float:
         """Gain by the largest usual change from day to day of a cause that is a scale, 0 for others and without a
         reference."""
-        if not candidate.effect.usual_change or not self.healthy.limits:
+        if not self.healthy.limits:
             return 0.0
-        largest = HABITUAL * max(candidate.effect.usual_change, self.dictionary.nominal.arm.gain_std)
+        largest = HABITUAL * usual_change(candidate.effect, self.dictionary.nominal.arm)
         return self.dictionary.information(candidate).get(repr(Shape()), 0.0) * largest**2
 
     def refined(self, trial: Trial) -> Trial:

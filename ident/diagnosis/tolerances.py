@@ -13,6 +13,7 @@ import numpy as np
 
 from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.evidence import Evidence, Rows
+from ident.diagnosis.nominal import NominalArm
 from ident.diagnosis.reference import USUAL_CHANGES
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import (
@@ -148,6 +149,11 @@ def _usual_share(entry: Mapping[str, Any], effect: Effect) -> float:
     size, scatter = (float(np.linalg.norm([one[name] for one in linear])) for name in ("value", "std"))
     own = scatter / max(size, 1e-300)
     return float(np.sqrt((USUAL_CHANGES * effect.usual_share**2 + own**2) / (USUAL_CHANGES + 1.0)))
+
+
+def usual_change(effect: Effect, arm: NominalArm) -> float:
+    """Standard deviation from day to day of a cause that is a scale, 0 for others."""
+    return max(effect.usual_change, arm.gain_std) if effect.usual_change else 0.0
 
 
 def gain_rows(dictionary: Dictionary) -> dict[int, Rows]:

@@ -1,16 +1,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.candidates import Candidate, Trial
+from ident.diagnosis.findings import _parameters
 from ident.diagnosis.intervals import estimated, phases_of
 from ident.diagnosis.signatures import signature_bench
+from ident.diagnosis.tolerances import usual_change
 from ident.dynamics.kinematics import Chain
-from ident.effects import EFFECTS, Shape
+from ident.effects import EFFECTS, SENSOR_GAIN, Shape
 from lwr_driver.session import Session
 
 AMPLITUDE, VELOCITY = 0.4, 0.15
@@ -41,6 +45,17 @@ def test_values_are_those_of_all_parameters_at_a_time(bench: DiagnosisBench, beg
     assert 0.005 < deviations["velocity"] < 0.06
     assert 0.01 < deviations["amplitude"] < 0.2
     assert bench.evidence.extra == before
+
+
+def test_beside_a_reference_a_scale_has_its_change_from_day_to_day(bench: DiagnosisBench) -> None:
+    found = bench.dictionary.trial(Candidate(SENSOR_GAIN, 1), Shape())
+    assert found is not None
+    alone = _parameters(found, bench)["error"]
+    evidence = copy(bench.evidence)
+    evidence.compared = True
+    beside = _parameters(found, replace(bench, evidence=evidence))["error"]
+    assert beside.std == pytest.approx(float(np.hypot(alone.std, bench.nominal.arm.gain_std)))
+    assert usual_change(EFFECTS["stribeck"], bench.nominal.arm) == 0.0
 
 
 def test_far_from_the_best_shape_no_step_is_made(bench: DiagnosisBench) -> None:
