@@ -153,18 +153,21 @@ def _beside_gaps(columns: JointColumns) -> Flags:
 
 
 def _lost(columns: JointColumns) -> int:
-    """Number of lost samples by the counter of the source, without one by the gaps of an otherwise even clock.
+    """Number of lost samples by the counter of the source, else by the gaps of an otherwise even clock: a counter may
+    be the number of the row.
 
-    A gap of lost samples is a whole number of periods; a longer one is a pause of the recording.
+    A gap of lost samples is a whole number of periods; a longer one is a pause of the recording, and after a late
+    sample the next one comes early.
     """
-    if columns.numbered:
+    if columns.lost:
         return columns.lost
     steps = _periods(columns)
     whole = np.rint(steps)
     on_clock = np.abs(steps - whole) < _OFF_CLOCK
     if not len(steps) or np.mean(on_clock & (whole == 1.0)) < _EVEN:
         return 0
-    missing = on_clock & (whole > 1.0) & (steps * columns.period_s < _PAUSE_S)
+    early = np.append(steps[1:] < 1.0 - _OFF_CLOCK, False)
+    missing = on_clock & (whole > 1.0) & ~early & (steps * columns.period_s < _PAUSE_S)
     return int(np.sum(whole[missing] - 1.0))
 
 

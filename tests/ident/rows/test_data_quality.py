@@ -55,16 +55,25 @@ def test_without_a_counter_samples_missing_in_an_even_clock_are_lost():
     kept = np.ones(COUNT, dtype=bool)
     for row, lost in ((300, 1), (700, 4), (1100, 9)):
         kept[row : row + lost] = False
-    whole = columns(noisy(), sequence=np.zeros(COUNT, dtype=np.int64))
+    whole = columns(noisy())
 
-    def left(kept: np.ndarray, stamps: np.ndarray = whole.publish_time) -> JointColumns:
-        fields = ("sequence", "position", "velocity", "effort")
-        values = {name: getattr(whole, name)[kept] for name in fields}
-        return replace(whole, log_time=stamps[kept] + 10**15, publish_time=stamps[kept], **values)
+    def left(
+        kept: np.ndarray, stamps: np.ndarray = whole.publish_time, numbered: bool = True
+    ) -> JointColumns:
+        values = {name: getattr(whole, name)[kept] for name in ("position", "velocity", "effort")}
+        rows = np.arange(kept.sum()) if numbered else np.zeros(kept.sum(), dtype=np.int64)
+        return replace(
+            whole, log_time=stamps[kept] + 10**15, publish_time=stamps[kept], sequence=rows, **values
+        )
 
-    (loss,) = sample_loss([session(left(kept))])
-    # Positions jolt beside a gap, too, and are not stale.
-    assert (loss.lost, loss.repeated, loss.stale, loss.samples) == (14, 0, 0, COUNT - 14)
+    for numbered in (True, False):
+        # The number of the row is no counter of the source.
+        (loss,) = sample_loss([session(left(kept, numbered=numbered))])
+        # Positions jolt beside a gap, too, and are not stale.
+        assert (loss.lost, loss.repeated, loss.stale, loss.samples) == (14, 0, 0, COUNT - 14)
+    late = whole.publish_time.copy()
+    late[500:1500:100] += round(0.99e9 / RATE)
+    assert sample_loss([session(left(np.ones(COUNT, dtype=bool), late))]) == ()
     # A pause of the recording loses nothing, and a clock without a period tells of no loss.
     pause = np.ones(COUNT, dtype=bool)
     pause[500:1000] = False
