@@ -16,6 +16,7 @@ from ident.diagnosis.findings import limit_findings, loss_finding
 from ident.diagnosis.held_out import held_out
 from ident.diagnosis.models import changes_of, fitted_models, lasting, without_harm
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
+from ident.diagnosis.payloads import unchecked_masses
 from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.refit import left_by, refitted
@@ -192,6 +193,12 @@ def _notes(bench: DiagnosisBench, reference: Reference | None) -> list[str]:
         notes.append(
             "the reference shares no base parameter with these sessions: parameters are not compared"
         )
+    if reference is not None:
+        notes += [
+            f"payload {name!r}: its stated mass was not checked, for sessions with one payload alone do not tell it "
+            "from the last link, and the reference was learned without it; add a session without a payload"
+            for name in unchecked_masses(nominal.base, nominal.masses, reference)
+        ]
     for side, band in nominal.band_hz.items():
         if band is not None:
             notes.append(

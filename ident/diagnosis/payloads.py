@@ -17,6 +17,7 @@ from ident.diagnosis.confidence import LIMITS, Grounds, probability
 from ident.diagnosis.reference import WEIGHED, Reference, announced_masses
 from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.task import Task
+from ident.dynamics.base_set import BaseSet
 from ident.effects import PAYLOAD_ERROR
 from ident.estimators.estimate import fisher_limit
 
@@ -71,6 +72,15 @@ def other_masses(bench: DiagnosisBench, reference: Reference | None) -> list[Oth
         if abs(one.mass - expected) > _OTHER * expected and one.square > least:
             found.append(one)
     return found
+
+
+def unchecked_masses(base: BaseSet, masses: Mapping[str, float | None], reference: Reference) -> list[str]:
+    """Payloads with a stated mass [kg] that nothing is held against: not the healthy arm's, and in one base parameter
+    with the last link."""
+    checked = {payload for payload, _ in announced_masses(base, masses).values()}
+    own = reference.masses
+    same = {name for name in own if masses.get(name) is None or own[name] in (None, masses[name])}
+    return [name for name, mass in masses.items() if mass and name not in checked | same]
 
 
 def _healthy(bench: DiagnosisBench, reference: Reference) -> dict[int, tuple[float, float]]:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ident.diagnosis.payloads import OtherMass, other_masses, payload_finding, with_masses
+from ident.diagnosis.payloads import (
+    OtherMass,
+    other_masses,
+    payload_finding,
+    unchecked_masses,
+    with_masses,
+)
 from ident.diagnosis.reference import Reference, announced_masses
 from ident.diagnosis.task import Task
 from ident.dynamics.base_set import BaseSet, numeric_base
@@ -58,6 +65,17 @@ def test_a_mass_is_held_against_the_healthy_one_or_the_announced_one(base: BaseS
 @pytest.mark.parametrize(("mass", "std"), [(2.6, 0.3), (2.08, 0.01), (2.0, 0.01)])
 def test_an_uncertain_or_small_difference_is_none(base: BaseSet, mass: float, std: float) -> None:
     assert not other_masses(bench(base, mass, std), None)
+
+
+def test_a_stated_mass_that_nothing_is_held_against_is_told(base: BaseSet) -> None:
+    other = replace(healthy(base, 2.0, 0.02), masses={"other": None})
+    alone = numeric_base(base.structure, (Condition("weight", ("joint",)),))
+    assert unchecked_masses(alone, MASSES, other) == ["weight"]
+    # Beside sessions without it the mass is a parameter; that of the healthy arm's payload is compared with it.
+    assert unchecked_masses(base, MASSES, other) == []
+    assert unchecked_masses(alone, MASSES, healthy(base, 2.0, 0.02)) == []
+    assert unchecked_masses(alone, {"weight": 3.0}, healthy(base, 2.0, 0.02)) == ["weight"]
+    assert unchecked_masses(alone, {"weight": None}, other) == []
 
 
 def test_the_finding_says_the_mass_and_is_surer_for_a_clearer_one() -> None:
