@@ -339,7 +339,7 @@ class State:
     def _scaled(self, candidate: Candidate) -> float:
         """Gain by the largest usual change from day to day of a cause that is a scale, 0 for others and without a
         reference."""
-        if not self.healthy.limits:
+        if not candidate.effect.usual_change or not self.healthy.limits:
             return 0.0
         largest = HABITUAL * usual_change(candidate.effect, self.dictionary.nominal.arm)
         return self.dictionary.information(candidate).get(repr(Shape()), 0.0) * largest**2
