@@ -20,6 +20,7 @@ from ident.screening.redundancy import Class, Fit, Normal, Part, Redundancy, Siz
 _EXPLAINED, _GAIN, _ZERO, _OF_LARGEST = 0.25, 0.18, 0.18, 0.02
 _DEVIATIONS = 5.0
 _LEFT = 0.75
+_NOTHING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,10 @@ def part_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PartError]:
     return [
         PartError(key, parts, kind, size.value + (kind == "gain"), size.std, size.left)
         for (key, parts, kind), size in zip(asked, sizes, strict=True)
-        if abs(size.value) > _DEVIATIONS * size.std and size.left < _LEFT
+        if abs(size.value) > _DEVIATIONS * size.std
+        and size.left < _LEFT
+        # A torque that is nothing there is no gain: `channels` finds it.
+        and (kind == "zero" or abs(size.value + 1.0) > _NOTHING)
     ]
 
 

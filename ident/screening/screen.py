@@ -12,7 +12,7 @@ The thresholds lie between the scores of true faults and of wrong explanations o
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -49,9 +49,8 @@ _LABEL = float(np.log(2.0))
 # Rows for each parameter, below which a fit explains anything.
 _ROWS = 3.0
 # Pass bands tried, over that of the settings: rows see the motion low-passed, and fast motion contradicts itself in a
-# narrow band. Below this residual over torque of all joints no wider one is tried.
-_BANDS = (1.0, 2.5)
-_IN_BAND = 0.05
+# narrow band. Fall of the score for which a wider one is taken.
+_BANDS, _CLEARER = (1.0, 2.5), 0.1
 _POSES = 64
 # Factor between an arm's gravity and its URDF's: 0.9 to 1.4 in six real arms. Correlation of gravity of the two, and
 # number of joints, to speak of a factor.
@@ -105,21 +104,26 @@ def _doubts(
     if any(doubt.certain for doubt in (*doubts, *beyond)):
         # A certain fault bends everything computed from it.
         return (*doubts, *beyond)
-    data = _rows(chosen, chain, signals, couplings, recall)
-    contradictions = [] if data is None else _contradictions(data, chosen)
+    contradictions, least = list[Doubt](), np.inf
+    for data in _in_bands(chosen, chain, signals, couplings, recall):
+        told, left, agree = _contradictions(data, chosen)
+        # The channels and their mending agree better in this band.
+        if left < least - _CLEARER:
+            contradictions, least = told, left
+        if agree and not told:
+            break
     found = [doubt for doubt in contradictions if not _shared(doubt, doubts)]
     return (*doubts, *found, *(doubt for doubt in beyond if not _shared(doubt, found)))
 
 
-def _rows(
+def _in_bands(
     sessions: Sequence[Session],
     chain: Chain,
     signals: SignalSettings,
     couplings: Sequence[Coupling],
     recall: Recall,
-) -> Redundancy | None:
-    """Rows of the sessions, in a wider band where the joints agree clearly better; None for too few rows."""
-    best, least = None, np.inf
+) -> Iterator[Redundancy]:
+    """Rows of the sessions in each band with enough of them for a contradiction, the narrowest first."""
     for factor in _BANDS:
         wider = replace(
             signals,
@@ -133,14 +137,8 @@ def _rows(
             # The fit itself says what is too short or does not move.
             logger.info("no screening by redundancy at %g Hz: %s", wider.decimate_hz, error)
             continue
-        if not (data.rows and data.enough(_ROWS)):
-            continue
-        fit = data.fit()
-        if fit.score < least - _DOUBT:
-            best, least = data, fit.score
-        if max(fit.rho.values(), default=0.0) < _IN_BAND:
-            break
-    return best
+        if data.rows and data.enough(_ROWS):
+            yield data
 
 
 def without_dead(problem: Problem, session: Session) -> Problem:
@@ -183,11 +181,13 @@ def _silent(sessions: Sequence[Session]) -> frozenset[Class]:
     )
 
 
-def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> list[Doubt]:
+def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> tuple[list[Doubt], float, bool]:
+    """Doubts, the score that is left with the explanations undone, and whether all joints agree as recorded."""
     normal = data.normal()
     fit = data.fit(normal)
     found: list[Doubt] = []
-    wrong = max(fit.rho.values()) > AGREES or any(map(is_wrong, data.gains(fit, normal).values()))
+    agree = max(fit.rho.values()) <= AGREES
+    wrong = not agree or any(map(is_wrong, data.gains(fit, normal).values()))
     if wrong or part_errors(data, fit, normal):
         explanations, data = explain(data, _supported)
         explanations = [_of_the_wrong_side(one) for one in explanations]
@@ -196,7 +196,7 @@ def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> list[Doubt
         normal = data.normal()
         fit = data.fit(normal)
     found += _physics(data, fit, normal)
-    return found or _positions(data, fit, normal) or _of_motors(data)
+    return found or _positions(data, fit, normal) or _of_motors(data), fit.score, agree
 
 
 def _positions(data: Redundancy, fit: Fit, normal: Normal) -> list[Doubt]:

@@ -31,7 +31,7 @@ from ident.screening.channels import check_channels
 from ident.screening.doubts import Doubt, settle
 from ident.screening.explanations import unit_of
 from ident.screening.positions import position_errors
-from ident.screening.screen import _rows, require_sound, screen, without_dead
+from ident.screening.screen import _in_bands, require_sound, screen, without_dead
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session
 
@@ -271,8 +271,7 @@ def test_a_position_with_a_small_error_is_told_with_its_size(
             position[:, place] = own + size if kind == "offset" else (1.0 + size) * own
         return replace(session, joint=replace(session.joint, position=position))
 
-    data = _rows([edited(session) for session in pair], chain(), SignalSettings(), (), Recall())
-    assert data is not None
+    data = next(_in_bands([edited(session) for session in pair], chain(), SignalSettings(), (), Recall()))
     normal = data.normal()
     (found,) = position_errors(data, data.fit(normal), normal)
     assert (chain().joint_names[found.joint], found.kind) == (name, kind)
@@ -280,8 +279,7 @@ def test_a_position_with_a_small_error_is_told_with_its_size(
 
 
 def test_positions_of_a_healthy_arm_have_no_small_error(pair: list[Session]) -> None:
-    data = _rows(pair, chain(), SignalSettings(), (), Recall())
-    assert data is not None
+    data = next(_in_bands(pair, chain(), SignalSettings(), (), Recall()))
     normal = data.normal()
     assert position_errors(data, data.fit(normal), normal) == []
 
