@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.dynamics.parameters import Floats
-from ident.screening.parts import PartError, part_errors, scopes
+from ident.screening.parts import DEVIATIONS, GAIN, LEFT, PartError, part_errors, scopes
 from ident.screening.redundancy import Class, Fit, Gain, Normal, Part, Redundancy
 
 # Ratios of units often mixed up, with their names.
@@ -32,10 +32,6 @@ _NEAR = 0.1
 AGREES = 0.1
 # Residual over torque of a joint, beyond which units, signs and other joints' torques are tried in parts of the data.
 _CONTRADICTS = 0.3
-# Least gain error of interest, and its standard deviations: sensors are calibrated to a few per cent.
-_GAIN, _DEVIATIONS = 0.18, 5.0
-# Largest share of the residual left by a true gain error.
-_LEFT = 0.75
 _POSITION_GAINS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 _PACES = (0.25, 0.5, 2.0 / 3.0, 0.8, 1.25, 1.5, 2.0, 4.0)
 # Fall of the score for which a plain factor is given up.
@@ -204,7 +200,7 @@ def _torque_gains(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Exp
 def is_wrong(gain: Gain) -> bool:
     """Whether a gain is off by more than a calibration and its deviation, and mending it helps."""
     off = abs(gain.value - 1.0)
-    return off > max(_GAIN, _DEVIATIONS * gain.std) and gain.left < _LEFT and gain.value != 0.0
+    return off > max(GAIN, DEVIATIONS * gain.std) and gain.left < LEFT and gain.value != 0.0
 
 
 def _pairs(data: Redundancy) -> list[tuple[int, int]]:

@@ -15,11 +15,13 @@ import numpy as np
 from ident.dynamics.parameters import Floats
 from ident.screening.redundancy import Class, Fit, Normal, Part, Redundancy, Size, solve
 
-# Share of a class's squared residual that an error of one part explains, and its size: of the gain, and of the zero
-# over the torque's rms, or over the largest of the side.
-_EXPLAINED, _GAIN, _ZERO, _OF_LARGEST = 0.25, 0.18, 0.18, 0.02
-_DEVIATIONS = 5.0
-_LEFT = 0.75
+GAIN, DEVIATIONS = 0.18, 5.0
+"""Least error of a gain of interest, and in its standard deviations: sensors are calibrated to a few per cent."""
+LEFT = 0.75
+"""Largest share of the residual left by a true error."""
+# Share of a class's squared residual that an error of one part explains, and size of a zero over the torque's rms, or
+# over the largest of the side.
+_EXPLAINED, _ZERO, _OF_LARGEST = 0.25, 0.18, 0.02
 _NOTHING = 1e-9
 
 
@@ -42,7 +44,10 @@ class PartError:
 def part_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PartError]:
     """Gains and zeros of single sessions, and of halves of them, beyond what a calibration and chance explain."""
     asked = list(_suspects(data, fit, normal))
-    computed = [data.shared_torque(rows, fit) for rows in data.rows]
+    if not asked:
+        return []
+    shared = data.shared(fit)
+    computed = [data.matrix(rows) @ shared for rows in data.rows]
 
     def columns(key: Class, parts: Sequence[Part], kind: str) -> list[Floats]:
         found = []
@@ -57,8 +62,8 @@ def part_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PartError]:
     return [
         PartError(key, parts, kind, size.value + (kind == "gain"), size.std, size.left)
         for (key, parts, kind), size in zip(asked, sizes, strict=True)
-        if abs(size.value) > _DEVIATIONS * size.std
-        and size.left < _LEFT
+        if abs(size.value) > DEVIATIONS * size.std
+        and size.left < LEFT
         # A torque that is nothing there is no gain: `channels` finds it.
         and (kind == "zero" or abs(size.value + 1.0) > _NOTHING)
     ]
@@ -71,12 +76,14 @@ def _suspects(
     place = {part: k for k, part in enumerate(normal.parts)}
     classes = {key: k for k, key in enumerate(normal.classes)}
     kinds: tuple[Literal["gain", "zero"], ...] = ("gain", "zero")
+    bodies = data.shared(fit)
     # W^T z, z^T z and z^T e by class, part and kind.
     shared = np.zeros((len(classes), len(place), 2, data.width))
     power, product = np.zeros((2, len(classes), len(place), 2))
     for rows in data.rows:
-        computed, measured = data.shared_torque(rows, fit), data.true_torque(rows)
-        for joint, own in enumerate(data.matrix(rows)):
+        matrix, measured = data.matrix(rows), data.true_torque(rows)
+        computed = matrix @ bodies
+        for joint, own in enumerate(matrix):
             if (row_class := classes.get((rows.side, joint))) is None:
                 continue
             error = measured[:, joint] - own @ fit.parameters
@@ -95,7 +102,7 @@ def _suspects(
     for key, k in classes.items():
         weight = fit.weight[key]
         largest = max(rms[other] for (side, _), other in classes.items() if side == key[0])
-        least = {"gain": _GAIN, "zero": max(_ZERO * float(rms[k]), _OF_LARGEST * largest)}
+        least = {"gain": GAIN, "zero": max(_ZERO * float(rms[k]), _OF_LARGEST * largest)}
         for parts in scopes(normal.parts):
             at = [place[part] for part in parts]
             for number, kind in enumerate(kinds):

@@ -408,7 +408,8 @@ class Redundancy:
         The computed torque of the class is an added column, so the gain comes from the other joints, the other side and
         other poses.
         """
-        computed = [self.shared_torque(rows, fit) for rows in self.rows]
+        shared = self.shared(fit)
+        computed = [self.matrix(rows) @ shared for rows in self.rows]
         columns = (
             [
                 _only(values, key[1] if rows.side == key[0] else None)
@@ -422,12 +423,10 @@ class Redundancy:
             for key, size in zip(normal.classes, sizes, strict=True)
         }
 
-    def shared_torque(self, rows: SampledRows, fit: Fit) -> Floats:
-        """Torque (n, K) [Nm] of the parameters that the joints share."""
-        shared = np.zeros_like(fit.parameters)
+    def shared(self, fit: Fit) -> Floats:
+        """Parameters (p,) of a fit that the joints share, zero for the others."""
         last = _BODY * (self.chain.n + len(self.payloads))
-        shared[:last] = fit.parameters[:last]
-        return np.asarray(self.matrix(rows) @ shared)
+        return np.where(np.arange(len(fit.parameters)) < last, fit.parameters, 0.0)
 
     def along(self, fit: Fit, normal: Normal, errors: Iterable[Sequence[Floats]]) -> Iterator[Size]:
         """Size of each error beside all parameters, with its standard deviation by blocks of rows.
