@@ -143,6 +143,17 @@ def shifted(channel: str, field: str, value: float, *joints: str) -> Change:
     return lambda sessions: _channel(sessions, channel, edit)
 
 
+def drifting(channel: str, field: str, value: float, *joints: str) -> Change:
+    """The joints' zero moves by `value` from the start of each log to its end."""
+
+    def edit(columns: JointColumns) -> JointColumns:
+        values = getattr(columns, field).copy()
+        values[:, [JOINTS.index(name) for name in joints]] += np.linspace(0.0, value, len(values))[:, None]
+        return replace(columns, **{field: values})
+
+    return lambda sessions: _channel(sessions, channel, edit)
+
+
 def in_one(change: Change, number: int = 0) -> Change:
     """The change in one session, the others as they were."""
     return lambda sessions: [
@@ -365,6 +376,8 @@ CASES: tuple[Case, ...] = (
     Case("joint A4 x 1.4 in one log", in_one(scaled(*L, 1.4, "A4"), 1), (JOINT, "A4")),
     Case("motor A3/A4 swapped in one log", in_one(swapped(*M, "A3", "A4"), 1), (MOTOR, "A3", "A4")),
     Case("joint A2 20 Nm off in one log", in_one(shifted(*L, 20.0, "A2")), (JOINT, "A2")),
+    Case("joint A2 drifts by 20 Nm in one log", in_one(drifting(*L, 20.0, "A2")), (JOINT, "A2")),
+    Case("motor A3 drifts by 10 Nm in both logs", drifting(*M, 10.0, "A3"), (MOTOR, "A3")),
     Case("motor A4 sign from the middle", from_the_middle(*M, scaled(*M, -1.0, "A4")), (MOTOR, "A4")),
     Case("joint A2 halved from the middle", from_the_middle(*L, scaled(*L, 0.5, "A2")), (JOINT, "A2")),
     Case("position E1 8 deg off in one log", in_one(turned(8.0, "E1"), 1), (POSITION, "E1")),

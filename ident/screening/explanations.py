@@ -15,6 +15,7 @@ import numpy as np
 
 from ident.dynamics.parameters import Floats
 from ident.screening.parts import DEVIATIONS, GAIN, LEFT, PartError, part_errors, scopes
+from ident.screening.positions import session_offsets
 from ident.screening.redundancy import Class, Fit, Gain, Normal, Part, Redundancy
 
 # Ratios of units often mixed up, with their names.
@@ -106,7 +107,10 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
         for candidate in _motions(data):
             drop = before - candidate.mended.fit(doubtful=False).score
             tried.append(replace(candidate, drop=drop))
-    tried += [scored(candidate)[0] for candidate in _of_parts(data, fit, normal)]
+    for candidate in _of_parts(data, fit, normal):
+        moved_rows = candidate.channel == "position"
+        drop = before - candidate.mended.fit(None if moved_rows else normal, doubtful=False).score
+        tried.append(replace(candidate, drop=drop))
     tried = [one for one in tried if believed(one, len(normal.classes))]
     # Of the session as a whole before its half.
     best = max(tried, key=lambda one: one.drop - _FINER * (len(one.parts) == 1), default=None)
@@ -132,19 +136,22 @@ def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanat
 
 
 def _of_parts(data: Redundancy, fit: Fit, normal: Normal) -> Iterator[Explanation]:
-    """A torque with another gain, zero or unit in one session or half of it, or two joints interchanged there."""
+    """A torque with another gain, zero, unit or joint in one session or half of it, or one that drifts."""
     eye = np.eye(data.chain.n)
     doubtful = set()
     for one in part_errors(data, fit, normal):
         side, joint = one.key
         doubtful.add((one.key, one.parts))
-        if one.kind == "zero":
-            mended = data.mapped(side, eye, -one.value * eye[joint], one.parts)
-            yield Explanation(f"{side} torque", (joint,), "another zero", mended, error=one, parts=one.parts)
-        else:
+        if one.kind == "gain":
             yield _scaled_part(data, one.key, one.parts, one.value, one)
+        else:
+            looks, along = ("another zero", (1.0, 0.0)) if one.kind == "zero" else ("a drift", (0.0, 1.0))
+            mended = data.mapped(side, eye, -one.value * np.outer(eye[joint], along), one.parts)
+            yield Explanation(f"{side} torque", (joint,), looks, mended, error=one, parts=one.parts)
     for key in (key for key, rho in fit.rho.items() if rho > _CONTRADICTS):
         doubtful |= {(key, parts) for parts in scopes(normal.parts)}
+    for offset in session_offsets(data, fit, normal):
+        yield Explanation("position", (offset.joint,), offset.looks_like, offset.mended, parts=offset.parts)
     pairs = set()
     for (side, joint), parts in sorted(doubtful):
         yield from (_scaled_part(data, (side, joint), parts, factor) for factor in (-1.0, 1e3, 1e-3))

@@ -7,7 +7,7 @@ most of it, so it shows only where other joints turn, too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -15,7 +15,8 @@ import numpy as np
 from scipy.linalg import null_space
 
 from ident.dynamics.parameters import Floats
-from ident.screening.redundancy import Fit, Normal, Redundancy, SampledRows
+from ident.screening.parts import sessions_of
+from ident.screening.redundancy import Fit, Normal, Part, Redundancy, SampledRows
 
 _DEVIATIONS = 6.0
 _STEP = 1e-3
@@ -47,13 +48,18 @@ KINDS: Mapping[str, _Kind] = {
 
 @dataclass(frozen=True)
 class PositionError:
-    """An error of a joint's recorded position: its kind, size and standard deviation, and the fall of the score."""
+    """An error of a joint's recorded position: its kind, size and standard deviation, and the fall of the score.
+
+    mended : the data with it undone. parts : of the data with it; none for all.
+    """
 
     joint: int
     kind: str
     size: float
     std: float
     drop: float
+    mended: Redundancy
+    parts: tuple[Part, ...] = ()
 
     @property
     def looks_like(self) -> str:
@@ -63,35 +69,58 @@ class PositionError:
 
 def position_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PositionError]:
     """The error that explains most, if there is one that explains enough, and more than a base that leans."""
-    found = []
-    before = [data.rigid(rows, fit) for rows in data.rows]
     # In motor torques alone, friction that follows no simple law looks like late positions.
     asked = [
-        (joint, kind)
+        (joint, kind, ())
         for joint in range(data.chain.n)
         for kind in KINDS
         if ("joint" in data.sides or kind != "delay")
         and not (data.chain.prismatic[joint] and kind == "offset")
     ]
+    found = [*_errors(data, fit, normal, asked), *session_offsets(data, fit, normal)]
+    best = max(found, key=lambda one: one.drop, default=None)
+    return [] if best is None or best.drop <= _leaning(data, fit, normal) else [best]
 
-    def columns(joint: int, kind: str) -> list[Floats]:
-        return [
-            (data.rigid(changed(rows, joint, kind, _STEP), fit) - torque) / _STEP
-            for rows, torque in zip(data.rows, before, strict=True)
-        ]
 
-    sizes = data.along(fit, normal, (columns(*one) for one in asked))
-    for (joint, kind), (size, std, _) in zip(asked, sizes, strict=True):
+def session_offsets(data: Redundancy, fit: Fit, normal: Normal) -> list[PositionError]:
+    """Zeros of positions that differ in one of several sessions."""
+    sessions = sessions_of(normal.parts)
+    turning = [joint for joint in range(data.chain.n) if not data.chain.prismatic[joint]]
+    asked = [(joint, "offset", parts) for parts in sessions for joint in turning]
+    return list(_errors(data, fit, normal, asked)) if len(sessions) > 1 else []
+
+
+def _errors(
+    data: Redundancy, fit: Fit, normal: Normal, asked: Sequence[tuple[int, str, tuple[Part, ...]]]
+) -> Iterator[PositionError]:
+    """Errors beyond chance and the least of interest: joint, kind and parts (none: all) of each."""
+    sizes = data.along(fit, normal, (_added(data, fit, *one) for one in asked))
+    for (joint, kind, parts), (size, std, _) in zip(asked, sizes, strict=True):
         # Beyond one the column says nothing.
         if not max(KINDS[kind].least, _DEVIATIONS * std) < abs(size) < 1.0:
             continue
-        rows = tuple(changed(part, joint, kind, size) for part in data.rows)
-        drop = fit.score - replace(data, rows=rows).fit(doubtful=False).score
+        mended = _changed(data, joint, kind, size, parts)
+        drop = fit.score - mended.fit(doubtful=False).score
         if drop > KINDS[kind].drop:
             recorded = {"offset": -size, "gain": 1.0 / (1.0 + size) - 1.0}.get(kind, size)
-            found.append(PositionError(joint, kind, recorded, std, drop))
-    best = max(found, key=lambda one: one.drop, default=None)
-    return [] if best is None or best.drop <= _leaning(data, fit, normal) else [best]
+            yield PositionError(joint, kind, recorded, std, drop, mended, parts)
+
+
+def _added(data: Redundancy, fit: Fit, joint: int, kind: str, parts: tuple[Part, ...]) -> list[Floats]:
+    """Torques (n, K) that an error by one adds to those of the bodies, for all sets of rows."""
+    return [
+        (data.rigid(after, fit) - data.rigid(before, fit)) / _STEP
+        if after is not before
+        else np.zeros_like(before.q.T)
+        for before, after in zip(data.rows, _changed(data, joint, kind, _STEP, parts).rows, strict=True)
+    ]
+
+
+def _changed(data: Redundancy, joint: int, kind: str, size: float, parts: tuple[Part, ...]) -> Redundancy:
+    rows = (
+        changed(rows, joint, kind, size) if not parts or rows.part in parts else rows for rows in data.rows
+    )
+    return replace(data, rows=tuple(rows))
 
 
 def _leaning(data: Redundancy, fit: Fit, normal: Normal) -> float:

@@ -6,7 +6,7 @@ channel contradicts the others. `Redundancy` keeps the normal equations of each 
 
     G_c = W_c^T W_c,   B_c = W_c^T Y,   T_c = covariance of Y,
 
-with the torques Y of all joints of the side and a column of ones. A changed torque channel (gain, sign, zero,
+with the torques of all joints of the side, a one and the time in Y. A changed torque channel (gain, sign, zero, drift,
 interchanged joints) is then a linear map of Y and needs no new rows. B_c and T_c are kept by part, half a session each,
 because a channel may be wrong in one session or from some moment on. The fit reweights each class by its own residual,
 so that a wrong channel does not bend the others: it stands out by its residual. The statistic of a class is rho, its
@@ -22,6 +22,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrs, dpstrf
 
 from ident.dynamics.kinematics import Chain
@@ -52,22 +53,26 @@ _NOTHING = 1e-10
 _BLOCK = 10
 _MOST_ROWS = 800
 _COVERED = 0.9
+# Share of rest in a row of a joint at rest, and of its moving rows, below which the others count, too.
+_RESTING, _HARDLY = 0.5, 0.1
 
 
-_ARRAYS = ("q", "qd", "qdd", "sign", "coupled", "torque", "slope")
+_ARRAYS = ("time", "q", "qd", "qdd", "sign", "coupled", "torque", "slope", "moving")
 
 
 @dataclass(frozen=True)
 class SampledRows:
     """Filtered motion and torque of one side of one session at the times of its rows.
 
-    q, qd, qdd, sign, torque, slope : (K, n); sign is the filtered sign(qd), slope the time derivative of the torque.
-    half : 0 or 1, of the session.
+    time : (K,) [s]; in `Redundancy` over the session's length, from 0 to 1. q, qd, qdd, sign, torque,
+    slope : (K, n); sign is the filtered sign(qd), slope the time derivative of the torque. moving : (K, n), bool; the
+    friction of a joint at rest may be any up to its Coulomb torque. half : 0 or 1, of the session.
     """
 
     side: str
     record: int
     payload: str | None
+    time: Floats
     q: Floats
     qd: Floats
     qdd: Floats
@@ -75,6 +80,7 @@ class SampledRows:
     coupled: Floats
     torque: Floats
     slope: Floats
+    moving: NDArray[np.bool_]
     half: int = 0
 
     @property
@@ -158,16 +164,20 @@ def _rows(
     both = np.column_stack([channel.qd[:, a] + channel.qd[:, b] for a, b in couplings] or [channel.qd[:, :0]])
     motion = [channel.q, channel.qd, channel.qdd, np.sign(channel.qd), np.sign(both)]
     q, qd, qdd, sign, coupled = (middle.apply(block_means(values, factor))[kept] for values in motion)
+    resting = (np.abs(channel.qd) < signals.standstill_rad_s).astype(np.float64)
+    moving = middle.apply(block_means(resting, factor))[kept] < _RESTING
     slope = (low_pass(step).apply(torque) - low_pass(-step).apply(torque)) / (2.0 * step)
     smooth = middle.apply(torque)[kept]
-    return SampledRows(channel.side, record, payload, q, qd, qdd, sign, coupled, smooth, slope[kept])
+    return SampledRows(
+        channel.side, record, payload, at[kept], q, qd, qdd, sign, coupled, smooth, slope[kept], moving
+    )
 
 
 @dataclass(frozen=True)
 class Normal:
     """Normal equations of the m classes, the torques' of the o parts.
 
-    matrix : G (m, p, p). mixed : B (m, o, p, n + 1). scatter, square : T (m, o, n + 1, n + 1) without the mean of the
+    matrix : G (m, p, p). mixed : B (m, o, p, n + 2). scatter, square : T (m, o, n + 2, n + 2) without the mean of the
     session, and S with it.
     """
 
@@ -223,8 +233,8 @@ class Redundancy:
     """The rows of an arm and the classes in use.
 
     rows : all sides and sessions. silent : classes left out (dead sensors). couplings : pairs of joints.
-    maps : (n + 1, n + 1) by side, [true torque, 1] = map @ [measured torque, 1]. own : the same by side and part,
-    after them.
+    maps : (n + 2, n + 2) by side, [true torque, 1, time] = map @ [measured torque, 1, time]. own : the same by side and
+    part, after them.
     """
 
     chain: Chain
@@ -250,7 +260,7 @@ class Redundancy:
         rows = sampled(sessions, signals, pairs, recall)
         count = max((sum(len(r.q) for r in rows if r.side == side) for side in ("joint", "motor")), default=0)
         step = max(1, -(-count // _MOST_ROWS))
-        return cls(chain, tuple(_halves([r.thinned(step) for r in rows])), silent, pairs)
+        return cls(chain, tuple(_halves(_timed(_moving([r.thinned(step) for r in rows])))), silent, pairs)
 
     @cached_property
     def sides(self) -> tuple[str, ...]:
@@ -314,57 +324,63 @@ class Redundancy:
         place = {key: k for k, key in enumerate(key for key in classes if key not in self.silent)}
         width, parts = self.width, tuple(sorted({rows.part for rows in self.rows}))
         matrix = np.zeros((len(place), width, width))
-        mixed = np.zeros((len(place), len(parts), width, n + 1))
-        scatter, square = np.zeros((2, len(place), len(parts), n + 1, n + 1))
+        mixed = np.zeros((len(place), len(parts), width, n + 2))
+        scatter, square = np.zeros((2, len(place), len(parts), n + 2, n + 2))
         means = self._means()
         for rows in self.rows:
-            torque, o = _with_one(rows.torque), parts.index(rows.part)
-            centred = torque - np.append(means[rows.side, rows.record], 1.0)
-            products = centred.T @ centred, torque.T @ torque
-            for j, own in enumerate(self.matrix(rows)):
+            torque, o = _extended(rows), parts.index(rows.part)
+            mean = means[rows.side, rows.record]
+            for j, (own, moving) in enumerate(zip(self.matrix(rows), rows.moving.T, strict=True)):
                 if (k := place.get((rows.side, j))) is None:
                     continue
                 # A joint's torque has the bodies behind it and its own drive alone.
                 used = np.flatnonzero(own.any(axis=0))
-                part = own[:, used]
+                part, seen = own[np.ix_(moving, used)], torque[moving]
                 matrix[k][np.ix_(used, used)] += part.T @ part
-                mixed[k, o, used] += part.T @ torque
-                scatter[k, o] += products[0]
-                square[k, o] += products[1]
+                mixed[k, o, used] += part.T @ seen
+                centred = seen - mean[j]
+                scatter[k, o] += centred.T @ centred
+                square[k, o] += seen.T @ seen
         return Normal(tuple(place), parts, matrix, mixed, scatter, square)
 
     def _means(self) -> dict[tuple[str, int], Floats]:
-        """Mean torque (n,) of each side of each session."""
-        torques: dict[tuple[str, int], list[Floats]] = {}
+        """Means (n, n + 2) of torques, one and time of a side of a session, over the moving rows of each joint."""
+        sums: dict[tuple[str, int], Floats] = {}
         for rows in self.rows:
-            torques.setdefault((rows.side, rows.record), []).append(rows.torque)
-        return {key: np.concatenate(values).mean(axis=0) for key, values in torques.items()}
+            key = rows.side, rows.record
+            sums[key] = sums.get(key, 0.0) + rows.moving.T.astype(np.float64) @ _extended(rows)
+        # The sum of the ones is the number of rows.
+        return {key: values / np.maximum(values[:, -2:-1], 1.0) for key, values in sums.items()}
 
     def enough(self, share: float) -> bool:
         """Whether there are `share` rows for each parameter."""
-        count = sum(len(rows.q) for rows in self.rows) * self.chain.n - len(self.silent)
+        count = sum(int(rows.moving.sum()) for rows in self.rows) - len(self.silent)
         return count >= share * self.width
 
     def map_of(self, side: str, part: Part | None = None) -> Floats:
-        """(n + 1, n + 1), [true torque, 1] = map @ [measured torque, 1]; of a side, or of a part's."""
-        whole = self.maps.get(side, np.eye(self.chain.n + 1))
+        """(n + 2, n + 2), [true torque, 1, time] = map @ the same as measured; of a side, or of a part's."""
+        whole = self.maps.get(side, np.eye(self.chain.n + 2))
         return whole if part is None or (side, part) not in self.own else self.own[side, part] @ whole
 
     def mapped(
         self, side: str, matrix: Floats, shift: Floats | float = 0.0, parts: Sequence[Part] = ()
     ) -> Redundancy:
-        """The data with true torque = `matrix` (n, n) @ torque + `shift` (n,) [Nm] on a side, or some of its parts."""
-        change = np.eye(self.chain.n + 1)
-        change[:-1, :-1], change[:-1, -1] = matrix, shift
+        """The data with true torque = `matrix` (n, n) @ torque + shift on a side, or some of its parts.
+
+        shift : (n, 2) [Nm], at the start of a session and from there to its end.
+        """
+        n = self.chain.n
+        change = np.eye(n + 2)
+        change[:n, :n], change[:n, n:] = matrix, shift
         if not parts:
             return replace(self, maps={**self.maps, side: change @ self.map_of(side)})
-        unchanged = np.eye(self.chain.n + 1)
+        unchanged = np.eye(n + 2)
         own = {(side, part): change @ self.own.get((side, part), unchanged) for part in parts}
         return replace(self, own={**self.own, **own})
 
     def true_torque(self, rows: SampledRows) -> Floats:
         """Torque (K, n) with the changes of the channel undone."""
-        return np.asarray(_with_one(rows.torque) @ self.map_of(rows.side, rows.part)[:-1].T)
+        return np.asarray(_extended(rows) @ self.map_of(rows.side, rows.part)[: self.chain.n].T)
 
     def fit(self, normal: Normal | None = None, *, doubtful: bool = True) -> Fit:
         """Weighted least squares, each class weighted by its own residual.
@@ -373,7 +389,7 @@ class Redundancy:
         """
         normal = self.normal() if normal is None else normal
         maps = [[self.map_of(side, part)[joint] for part in normal.parts] for side, joint in normal.classes]
-        chosen = np.array(maps).reshape(-1, len(normal.parts), self.chain.n + 1)
+        chosen = np.array(maps).reshape(-1, len(normal.parts), self.chain.n + 2)
         mixed = np.einsum("kopn,kon->kp", normal.mixed, chosen)
         scatter, square = (
             np.einsum("kon,konm,kom->k", chosen, part, chosen) for part in (normal.scatter, normal.square)
@@ -438,18 +454,18 @@ class Redundancy:
         table = []
         for rows in self.rows:
             matrix = self.matrix(rows)
-            weight = np.array([fit.weight.get((rows.side, j), 0.0) for j in range(self.chain.n)])
+            weight = self.weights(rows, fit)
             left = self.true_torque(rows).T - matrix @ fit.parameters
             table.append((matrix, weight, left))
         for columns in errors:
             shared = np.zeros_like(fit.parameters)
             for (matrix, weight, _), column in zip(table, columns, strict=True):
                 for own, c, w in zip(matrix, column, weight, strict=True):
-                    if w and c.any():
-                        shared += w * (c @ own)
+                    if w.any() and c.any():
+                        shared += (w * c) @ own
             others = solve(total, shared)
             parts = [
-                (column, column - matrix @ others, weight[:, None], left)
+                (column, column - matrix @ others, weight, left)
                 for (matrix, weight, left), column in zip(table, columns, strict=True)
             ]
             den = max(sum(float(np.sum(weight * rest**2)) for _, rest, weight, _ in parts), 1e-300)
@@ -469,6 +485,11 @@ class Redundancy:
             left_over = float(np.sqrt(after / before)) if before > 0.0 else 1.0
             yield Size(size, float(np.sqrt(max(together, apart))) / den, left_over)
 
+    def weights(self, rows: SampledRows, fit: Fit) -> Floats:
+        """Weights (n, K) of the rows of all joints, none of a joint at rest."""
+        classes = [fit.weight.get((rows.side, joint), 0.0) for joint in range(self.chain.n)]
+        return np.asarray(np.array(classes)[:, None] * rows.moving.T)
+
     def rigid(self, rows: SampledRows, fit: Fit) -> Floats:
         """Torque (n, K) [Nm] of the bodies of a fit."""
         n = self.chain.n
@@ -484,11 +505,11 @@ class Redundancy:
         spreads = np.column_stack([solve(total, direction) for direction in directions])
         variance = np.zeros(len(directions))
         for rows in self.rows:
-            measured = self.true_torque(rows)
-            for j, own in enumerate(self.matrix(rows)):
-                if (rows.side, j) in fit.weight:
-                    error = measured[:, j] - own @ fit.parameters
-                    product = fit.weight[rows.side, j] * (own @ spreads) * error[:, None]
+            measured = self.true_torque(rows).T
+            for own, true, weight in zip(self.matrix(rows), measured, self.weights(rows, fit), strict=True):
+                if weight.any():
+                    error = true - own @ fit.parameters
+                    product = (own @ spreads) * (weight * error)[:, None]
                     blocks = np.add.reduceat(product, np.arange(0, len(product), _BLOCK), axis=0)
                     variance += np.sum(blocks**2, axis=0)
         return np.sqrt(variance)
@@ -505,9 +526,31 @@ def _halves(rows: Sequence[SampledRows]) -> Iterator[SampledRows]:
         seen[key] += len(one.q)
 
 
-def _with_one(torque: Floats) -> Floats:
-    """The torques (K, n) and a column of ones."""
-    return np.column_stack([torque, np.ones(len(torque))])
+def _moving(rows: Sequence[SampledRows]) -> list[SampledRows]:
+    """The rows, with those at rest of a joint that hardly moves."""
+    count = sum(len(one.q) for one in rows)
+    hardly = sum(one.moving.sum(axis=0) for one in rows) < _HARDLY * count
+    return [replace(one, moving=one.moving | hardly) for one in rows]
+
+
+def _timed(rows: Sequence[SampledRows]) -> list[SampledRows]:
+    """The rows with their times from 0 to 1 of the session."""
+    times: dict[tuple[str, int], list[Floats]] = {}
+    for one in rows:
+        times.setdefault((one.side, one.record), []).append(one.time)
+    whole = {key: np.concatenate(parts) for key, parts in times.items()}
+    start = {key: float(np.min(values)) for key, values in whole.items()}
+    length = {key: float(np.ptp(values)) or 1.0 for key, values in whole.items()}
+    places = [(one.side, one.record) for one in rows]
+    return [
+        replace(one, time=(one.time - start[key]) / length[key])
+        for one, key in zip(rows, places, strict=True)
+    ]
+
+
+def _extended(rows: SampledRows) -> Floats:
+    """The measured torques (K, n + 2), a one and the time."""
+    return np.column_stack([rows.torque, np.ones(len(rows.torque)), rows.time])
 
 
 def _only(values: Floats, joint: int | None) -> Floats:

@@ -60,6 +60,10 @@ _DEVIATIONS, _SHARE = 5.0, 0.1
 # Drive inertias over their standard deviations, together (Stouffer) and of one joint at most: joint torque sensors of
 # four real arms reach 0.7 together, motor torques of five simulated ones 6 to 20.
 _DRIVES, _MOST_BY_ONE = 5.0, 10.0
+_MEND_POSITION = (
+    "check zero and gain of this channel (`offset_rad` and `scale` in the mapping of the import) and the joint's frame "
+    "in the URDF"
+)
 # Latest screenings: the same recordings are estimated several times.
 _MOST_SCREENED = 64
 
@@ -196,25 +200,28 @@ def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> tuple[list
         normal = data.normal()
         fit = data.fit(normal)
     found += _physics(data, fit, normal)
-    return found or _positions(data, fit, normal) or _of_motors(data), fit.score, agree
+    return found or _positions(data, fit, normal, sessions) or _of_motors(data), fit.score, agree
 
 
-def _positions(data: Redundancy, fit: Fit, normal: Normal) -> list[Doubt]:
+def _positions(data: Redundancy, fit: Fit, normal: Normal, sessions: Sequence[Session]) -> list[Doubt]:
     """Small errors of positions; no certain ones, for drawing and arm may differ as well."""
     names = data.chain.joint_names
     return [
         Doubt(
             "position",
             (names[one.joint],),
-            "contradicts the torques of the other joints; the residuals of all torques together fall by a factor of "
-            f"{np.exp(one.drop):.3g} with it undone",
+            f"contradicts the torques of the other joints; {_better(one.drop)}",
             one.looks_like,
-            "check zero and gain of this channel (`offset_rad` and `scale` in the mapping of the import) and the "
-            "joint's frame in the URDF",
+            _MEND_POSITION,
             False,
+            sessions[one.parts[0][0]].path.name if one.parts else "",
         )
         for one in position_errors(data, fit, normal)
     ]
+
+
+def _better(drop: float) -> str:
+    return f"the residuals of all torques together fall by a factor of {np.exp(drop):.3g} with it undone"
 
 
 def _of_the_wrong_side(one: Explanation) -> Explanation:
@@ -256,9 +263,7 @@ def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
     joints = tuple(names[joint] for joint in one.joints)
     channel, session = one.channel, ""
     certain = one.drop > _CERTAIN
-    better = (
-        f"the residuals of all torques together fall by a factor of {np.exp(one.drop):.3g} with it undone"
-    )
+    better = _better(one.drop)
     if one.gain is not None:
         seen = f"is {one.factor:.4g} times the torque computed from all other channels"
         if len(joints) == 1:
@@ -266,9 +271,17 @@ def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
         strange = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
         certain = strange and one.gain.left < _LEFT
         mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
+    elif one.parts and channel == "position":
+        session, seen = (
+            sessions[one.parts[0][0]].path.name,
+            f"contradicts the torques and the other sessions; {better}",
+        )
+        mend = _MEND_POSITION
     elif one.parts:
         session, seen, certain = _of_part(one, sessions)
         mend = "check this channel there; the mapping of its import mends a known factor (`scale`) or order of columns"
+        if one.error is not None and one.error.kind == "drift":
+            mend = "leave the session out, or record it with warm electronics"
     elif channel == "payload":
         session = sessions[int(one.label)].path.name
         stated = payload_name(sessions[int(one.label)]) or "none"
@@ -295,11 +308,16 @@ def _of_part(one: Explanation, sessions: Sequence[Session]) -> tuple[str, str, b
     session = sessions[record].path.name
     if len(one.parts) == 1:
         session += f", {('first', 'second')[half]} half"
+    elif {other for other, _ in one.parts} != {record}:
+        session = "all sessions"
     rest = "the torque computed from all other channels and the rest of the data"
     if one.error is None:
         seen = f"contradicts {rest}" if len(one.joints) > 1 else f"is about {one.factor:g} times {rest}"
         return session, seen, len(one.joints) == 1 or one.drop > _CERTAIN
     value, std = one.error.value, one.error.std
+    if one.error.kind == "drift":
+        way = "rises" if value > 0.0 else "falls"
+        return session, f"{way} by {abs(value):.3g} ± {std:.2g} Nm from start to end against {rest}", False
     if one.error.kind == "zero":
         more = "higher" if value > 0.0 else "lower"
         return session, f"is {abs(value):.3g} ± {std:.2g} Nm {more} than {rest}", False

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.wrong_channels import (
     clipped,
     constant,
+    drifting,
     from_the_middle,
     frozen,
     in_one,
@@ -20,6 +21,7 @@ from benchmarks.wrong_channels import (
     scaled,
     shifted,
     swapped,
+    turned,
     with_speed,
     without,
 )
@@ -96,6 +98,7 @@ M, L = ("motor", "effort"), ("joint", "effort")
         (in_one(shifted(*L, 20.0, "A2")), "joint", ("A2",), "another zero", False, None),
         (from_the_middle(*M, scaled(*M, -1.0, "A4")), "motor", ("A4",), "second half", True, 0),
         (from_the_middle(*L, scaled(*L, 0.7, "A2")), "joint", ("A2",), "second half", False, 0),
+        (in_one(drifting(*L, -15.0, "A2"), 1), "joint", ("A2",), "falls by 13", False, 1),
     ],
 )
 def test_a_torque_wrong_in_a_part_of_the_data_is_named_with_it(  # type: ignore[no-untyped-def]
@@ -107,6 +110,42 @@ def test_a_torque_wrong_in_a_part_of_the_data_is_named_with_it(  # type: ignore[
     # Which of two sessions has the right zero cannot be told.
     if where is not None:
         assert found.session.startswith(pair[where].path.name)
+
+
+def test_a_torque_that_drifts_in_each_session_is_named_in_all_of_them(pair: list[Session]) -> None:
+    (found,) = doubts(drifting(*M, 10.0, "A3")(pair))
+    assert (found.channel, found.joints, found.session) == ("motor torque", ("A3",), "all sessions")
+    assert "rises by" in found.seen
+
+
+@pytest.mark.parametrize(("number", "degrees", "joint"), [(0, 12.0, "A2"), (1, 8.0, "E1"), (1, -15.0, "A3")])
+def test_another_zero_of_a_position_is_named_in_its_session(
+    pair: list[Session], number: int, degrees: float, joint: str
+) -> None:
+    (found,) = doubts(in_one(turned(degrees, joint), number)(pair))
+    assert (found.channel, found.joints, found.session) == ("position", (joint,), pair[number].path.name)
+    told = float(found.looks_like.removeprefix("a zero offset of ").split()[0])
+    assert told == pytest.approx(degrees, rel=0.1)
+
+
+def test_the_torque_of_a_joint_at_rest_has_no_part(pair: list[Session]) -> None:
+    """Its friction is any up to the Coulomb torque. A joint that hardly moves at all keeps its rows."""
+
+    def fit(share: float, more: float) -> dict[tuple[str, int], float]:
+        joint = pair[0].joint
+        position, effort, first = (
+            joint.position.copy(),
+            joint.effort.copy(),
+            round(share * len(joint.position)),
+        )
+        position[first:, 5] = position[first, 5]
+        effort[first + round(3.0 / joint.period_s) :, 5] += more
+        resting = replace(pair[0], joint=replace(joint, position=position, effort=effort), motor=None)
+        data = next(iter(_in_bands([resting], chain(), SignalSettings(), (), Recall())))
+        return dict(data.fit().rho)
+
+    assert fit(0.5, 20.0) == pytest.approx(fit(0.5, 0.0), rel=1e-6)
+    assert fit(0.05, 20.0)["joint", 5] != pytest.approx(fit(0.05, 0.0)["joint", 5], rel=1e-3)
 
 
 @pytest.mark.parametrize("side", ["motor", "joint"])
