@@ -91,7 +91,7 @@ class PreslidingHysteresis(Effect):
 
         def turning(whole: ArmMotion) -> Floats:
             speed = whole.motor_speed[:, joint]
-            return turned_friction(np.cumsum(speed) * whole.dt, shape["length"], float(speed[0]))
+            return turned_friction(np.cumsum(speed) * whole.dt, speed, shape["length"])
 
         state = motion.along(turning, "turning", joint, shape["length"])
         return (Column(motor=state - motion.direction[:, joint]),)

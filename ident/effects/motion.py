@@ -24,8 +24,10 @@ _BY_SAMPLE = (
 )  # fmt: skip
 # Values along a whole motion remembered for its parts.
 _KEPT = 4
-# A drive at a tenth of this speed is at rest.
+# A drive that begins with a tenth of this speed is at rest.
 _REST_RAD_S = 0.01
+STILL_RAD_S = 2e-3
+"""A slower drive rests, and its friction stays what it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,9 +230,15 @@ def dahl(path, length, start):  # type: ignore[no-untyped-def]
     return out
 
 
-def turned_friction(path: Floats, length: float, speed: float) -> Floats:
-    """`dahl` along a path that begins with a speed [rad/s]: from a rest, with no friction to either side."""
-    return np.asarray(dahl(np.ascontiguousarray(path), length, float(np.tanh(speed / _REST_RAD_S))))
+def turned_friction(path: Floats, speed: Floats, length: float) -> Floats:
+    """`dahl` along a path (N,) with its speed (N,) [rad/s]; one that begins at rest, without friction to either side.
+
+    A drive slower than `STILL_RAD_S` rests and keeps its friction: what a low-pass leaves of a stop, and the steps of
+    an encoder, turn none.
+    """
+    steps = np.diff(path, prepend=path[:1])
+    steps[np.abs(speed) < STILL_RAD_S] = 0.0
+    return np.asarray(dahl(np.cumsum(steps), length, float(np.tanh(speed[0] / _REST_RAD_S))))
 
 
 @njit(cache=True, nogil=True)

@@ -6,9 +6,10 @@ So the residual over all samples of each motor torque is held against Dahl's sta
 
     e = a (z(L) - s),   dz = (1 - z sign(dx)) dx / L,
 
-for lengths L of a grid. Length and amplitude a are those of least squares, their standard deviations from the
-estimates without a tenth of the blocks in turn. A joint gets the effect if the squared error of blocks held back falls
-by 2 % and by two of its standard errors.
+for lengths L of a grid. All of the Coulomb friction turns (a), or the share of least squares where that is better by 2
+% of the squared error of blocks held back and by two of its standard errors; a joint gets the effect if that falls by
+as much. Friction at rest is any up to the Coulomb torque, and no length is taken that follows it at the cost of motion.
+The standard deviations are from the estimates without a tenth of the blocks in turn.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from ident.dynamics.parameters import Floats
 from ident.effects import PRESLIDING, entry_of
-from ident.effects.motion import turned_friction
+from ident.effects.motion import STILL_RAD_S, turned_friction
 from ident.estimation.scores import inside
 from ident.estimation.validate import predictor
 from ident.model.dynamic_model import DynamicModel
@@ -30,11 +31,12 @@ from ident.model.signals import signal_settings
 from ident.rows.content import Recall
 from ident.rows.prepare import prepare
 from ident.rows.prepared import TorqueChannel
+from ident.rows.reversals import TURNING_RAD, away_from_reversals
 from ident.rows.sessions import payload_name
 from lwr_driver.session import Session
 
 # Lengths to try [rad].
-_LENGTHS = np.geomspace(5e-5, 0.1, 23)
+_LENGTHS = np.geomspace(1e-5, 0.1, 27)
 _BLOCK_S, _LEAST_BLOCKS, _FOLDS = 1.0, 16, 10
 # Longest part of all sessions together [s].
 _MOST_S = 240.0
@@ -83,16 +85,16 @@ def friction_turning(
         return None
     sums = [_Sums.of(model, *one) for one in _channels(model, sessions, recall)]
     whole = _Sums.joined(sums) if sums else None
-    if whole is None or len(whole.error) < _LEAST_BLOCKS:
+    if whole is None or len(whole.torque) < _LEAST_BLOCKS:
         return None
     coulomb = drive_coulomb(model, sensed=any(bool(s.joint.effort.shape[1]) for s in sessions))
     entries, names = [], []
-    left = whole.error.sum(axis=0)
+    left = whole.error[0].sum(axis=0)
     for joint, name in enumerate(model.structure.chain.joint_names):
         most = float(coulomb[joint])
-        if most <= 0.0 or not whole.pays(joint, most):
+        if most <= 0.0 or (share := whole.pays(joint, most)) is None:
             continue
-        place, amplitude = whole.best(joint, most)
+        place, amplitude = whole.best(joint, most, share=share)
         stds = whole.scatter(joint, most)
         values = {"amplitude": (amplitude, stds[0]), "length": (float(_LENGTHS[place]), stds[1])}
         entries.append(entry_of(PRESLIDING, [joint + 1], values))
@@ -101,7 +103,8 @@ def friction_turning(
     if not entries:
         return None
     before, after = (
-        100.0 * float(np.sqrt(power.sum() / whole.torque.sum())) for power in (whole.error.sum(axis=0), left)
+        100.0 * float(np.sqrt(power.sum() / whole.torque.sum()))
+        for power in (whole.error[0].sum(axis=0), left)
     )
     return Turning(tuple(entries), before, after, tuple(names))
 
@@ -135,8 +138,9 @@ def _channels(
 
 @dataclass(frozen=True)
 class _Sums:
-    """Sums over the samples of blocks: products of error and columns (b, n, L), squares of the columns (b, n, L),
-    squares of error and torque (b, n)."""
+    """Sums over the samples of blocks: products of error and columns (2, b, n, L) and squares of the columns
+    (2, b, n, L) and of the error (2, b, n), of all samples and of those in motion away from reversals; squares of the
+    torque (b, n)."""
 
     cross: Floats
     square: Floats
@@ -146,8 +150,11 @@ class _Sums:
     @classmethod
     def joined(cls, parts: Sequence[_Sums]) -> _Sums:
         """The blocks of all parts."""
-        table = zip(*((one.cross, one.square, one.error, one.torque) for one in parts), strict=True)
-        return cls(*(np.concatenate(column) for column in table))
+        cross, square, error = (
+            np.concatenate([getattr(one, name) for one in parts], axis=1)
+            for name in ("cross", "square", "error")
+        )
+        return cls(cross, square, error, np.concatenate([one.torque for one in parts]))
 
     @classmethod
     def of(
@@ -159,47 +166,66 @@ class _Sums:
             np.searchsorted(channel.times, np.arange(channel.times[0], channel.times[-1], _BLOCK_S))
         )
         n = error.shape[1]
-        cross, square = np.zeros((len(starts), n, len(_LENGTHS))), np.zeros((len(starts), n, len(_LENGTHS)))
+        cross, square = np.zeros((2, 2, len(starts), n, len(_LENGTHS)))
+        squared = np.zeros((2, len(starts), n))
         law = model.structure.coulomb(channel.qd)
+        away = away_from_reversals(channel.qd, channel.period_s, 0.0, STILL_RAD_S, TURNING_RAD)
         for joint in range(n):
             # As the model computes it: behind elastic joints the path of the link stands for that of the drive.
-            path, begins = channel.q[:, joint], float(channel.qd[0, joint])
-            for k, length in enumerate(_LENGTHS):
-                column = turned_friction(path, float(length), begins) - law[:, joint]
-                column *= used[:, joint]
-                cross[:, joint, k] = np.add.reduceat(column * error[:, joint], starts)
-                square[:, joint, k] = np.add.reduceat(column**2, starts)
+            path, speed = channel.q[:, joint], channel.qd[:, joint]
+            for place, counted in enumerate((used[:, joint], used[:, joint] & away[:, joint])):
+                own = error[:, joint] * counted
+                squared[place, :, joint] = np.add.reduceat(own**2, starts)
+                for k, length in enumerate(_LENGTHS):
+                    column = (turned_friction(path, speed, float(length)) - law[:, joint]) * counted
+                    cross[place, :, joint, k] = np.add.reduceat(column * own, starts)
+                    square[place, :, joint, k] = np.add.reduceat(column**2, starts)
         torque = np.where(used, channel.torque, 0.0)
-        return cls(cross, square, np.add.reduceat(error**2, starts), np.add.reduceat(torque**2, starts))
+        return cls(cross, square, squared, np.add.reduceat(torque**2, starts))
 
-    def best(self, joint: int, most: float, blocks: Any = slice(None)) -> tuple[int, float]:
-        """Place of the length and amplitude [Nm] of least squares in some blocks, from 0 to `most`."""
-        cross, square = self.cross[blocks, joint].sum(axis=0), self.square[blocks, joint].sum(axis=0)
-        amplitude = np.clip(cross / np.maximum(square, 1e-300), 0.0, most)
-        place = int(np.argmax(2.0 * amplitude * cross - amplitude**2 * square))
-        return place, float(amplitude[place])
+    def best(self, joint: int, most: float, blocks: Any = slice(None), *, share: bool) -> tuple[int, float]:
+        """Place of the length and amplitude [Nm] with the least squared error in some blocks, no larger away from
+        reversals; amplitude 0 without one.
+
+        share : whether the amplitude is that of least squares, from 0 to `most`, or `most`.
+        """
+        cross, square = (values[:, blocks, joint].sum(axis=1) for values in (self.cross, self.square))
+        amplitude = np.full(len(_LENGTHS), most)
+        if share:
+            amplitude = np.clip(cross[0] / np.maximum(square[0], 1e-300), 0.0, most)
+        fall, away = 2.0 * amplitude * cross - amplitude**2 * square
+        fall = np.where(away >= -_FELT * self.error[1, blocks, joint].sum(), fall, 0.0)
+        place = int(np.argmax(fall))
+        return place, float(amplitude[place]) if fall[place] > 0.0 else 0.0
 
     def fall(self, joint: int, place: int, amplitude: float) -> Floats:
         """Fall (b,) of the squares of the error in each block."""
-        return np.asarray(
-            2.0 * amplitude * self.cross[:, joint, place] - amplitude**2 * self.square[:, joint, place]
-        )
+        cross, square = self.cross[0, :, joint, place], self.square[0, :, joint, place]
+        return np.asarray(2.0 * amplitude * cross - amplitude**2 * square)
 
-    def pays(self, joint: int, most: float) -> bool:
-        """Whether the error of the even blocks falls by what the odd ones say, and the other way round."""
-        even = np.arange(len(self.error)) % 2 == 0
-        fall = np.where(
-            even,
-            self.fall(joint, *self.best(joint, most, ~even)),
-            self.fall(joint, *self.best(joint, most, even)),
+    def pays(self, joint: int, most: float) -> bool | None:
+        """Whether a share of the friction turns, or all of it; None for neither."""
+        whole, some = (self._held_back(joint, most, share) for share in (False, True))
+        share = self._clear(joint, some - whole)
+        return share if self._clear(joint, some if share else whole) else None
+
+    def _held_back(self, joint: int, most: float, share: bool) -> Floats:
+        """Fall (b,) in each half of the blocks by the other; drawn, for a motion may go on and off in turn."""
+        half = np.random.default_rng(0).permutation(len(self.torque)) % 2 == 0
+        by_other, by_half = (
+            self.fall(joint, *self.best(joint, most, blocks, share=share)) for blocks in (~half, half)
         )
+        return np.where(half, by_other, by_half)
+
+    def _clear(self, joint: int, fall: Floats) -> bool:
+        """Whether a fall (b,) is felt, and sure."""
         spread = float(np.std(fall, ddof=1) / np.sqrt(len(fall)))
-        return bool(fall.sum() > _FELT * self.error[:, joint].sum() and fall.mean() > _SURE * spread)
+        return bool(fall.sum() > _FELT * self.error[0, :, joint].sum() and fall.mean() > _SURE * spread)
 
     def scatter(self, joint: int, most: float) -> tuple[float, float]:
         """Jackknife standard deviations of amplitude [Nm] and length [rad], the latter with the step of the grid."""
-        group = np.arange(len(self.error)) % _FOLDS
-        found = [self.best(joint, most, group != k) for k in range(min(_FOLDS, len(self.error)))]
+        group = np.arange(len(self.torque)) % _FOLDS
+        found = [self.best(joint, most, group != k, share=True) for k in range(min(_FOLDS, len(self.torque)))]
         table = np.array([(amplitude, _LENGTHS[place]) for place, amplitude in found])
         step = float(np.log(_LENGTHS[1] / _LENGTHS[0])) / np.sqrt(12.0)
         amplitude, length = np.sqrt(len(table) - 1.0) * np.std(table, axis=0)
