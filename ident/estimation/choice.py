@@ -282,7 +282,8 @@ class _Comparison:
 
     further : columns (m, 2 + joints) of the tilt and the gains of `joints` for each group. total : (classes, q, q) of
     all rows. held : (parts, classes, q, q) of the rows of a part. near : the same with the rows beside them, missing in
-    the training. weights : of the candidates so far.
+    the training. sound : whether no channel is in doubt; a wrong one looks like gains of the others' sensors.
+    weights : of the candidates so far.
     """
 
     problem: Problem
@@ -295,6 +296,7 @@ class _Comparison:
     block_s: float
     full_rank: bool
     unseen: tuple[str, ...]
+    sound: bool
     weights: dict[Kind, Floats] = field(default_factory=dict)
 
     @classmethod
@@ -342,6 +344,7 @@ class _Comparison:
             block * problem.sample_time_s,
             bool(np.isfinite(found.condition_normalised)),
             found.estimate.prior_only,
+            not found.known.doubts,
         )
 
     def choice(self, tilted: Sequence[bool]) -> Choice:
@@ -421,7 +424,7 @@ class _Comparison:
         estimator, scale, tilt, gains = kind
         if scale is not None and scale < _LOOSEST:
             yield estimator, _LOOSER * scale, tilt, gains
-        if not gains and (beyond_chance := self._gains_of(kind)):
+        if self.sound and not gains and (beyond_chance := self._gains_of(kind)):
             yield estimator, scale, tilt, beyond_chance
 
     def _preferred(self, best: Sequence[Kind], found: Mapping[Kind, Floats]) -> Kind:
