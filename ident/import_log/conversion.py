@@ -372,7 +372,7 @@ def _nanoseconds(
     steps = np.diff(times)
     if base.equal == "spread" and (steps == 0).any() and (steps > 0).any():
         notes.append(
-            f"{place.rpartition('`: `')[2].strip('`'):<15} {int((steps == 0).sum())} samples share the time of the one "
+            f"{place.rpartition(': `')[2].rstrip('`'):<15} {int((steps == 0).sum())} samples share the time of the one "
             "before and are spread evenly up to the next time"
         )
         times = _spread(times)
