@@ -401,7 +401,10 @@ def _of_motors(data: Redundancy) -> list[Doubt]:
         for joint, value, deviation in zip(joints, inertia, std, strict=True)
         if value > 2.0 * deviation > 0.0
     )
-    mend = "import them as motor torques (`motor_torque` in the mapping), so that the drives are in the model"
+    mend = (
+        "import them as motor torques (`--torque motor`, or `motor_torque` in the mapping), so that the drives are in "
+        "the model"
+    )
     return [
         Doubt(
             "joint torque",

@@ -195,6 +195,7 @@ def test_motor_torques_that_pass_for_joint_torques_show_by_the_inertia_of_the_dr
 ) -> None:
     (doubt,) = doubts(mistaken(pair))
     assert (doubt.channel, doubt.looks_like, doubt.certain) == ("joint torque", "motor torques", False)
+    assert "`--torque motor`" in doubt.mend
     assert "A3" in doubt.seen
     assert "`motor_torque`" in doubt.mend
     assert doubts(without("motor", lambda sessions: sessions)(pair)) == ()
