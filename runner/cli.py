@@ -188,10 +188,19 @@ def _answer(ctx: click.Context, error: str = "", kind: str = "", exit_code: int 
 
 
 class _Screen(logging.Handler):
-    """Log records on standard error, above the live line."""
+    """Log records on standard error, above the live line; a warning about data once, however often they are read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._said: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write one record."""
+        if record.name.startswith("ident.") and record.levelno >= logging.WARNING:
+            said = record.getMessage()
+            if said in self._said:
+                return
+            self._said.add(said)
         status.write(self.format(record))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import fcntl
 import io
+import logging
 import os
 import pty
 import re
@@ -20,6 +21,7 @@ import pyte
 import pytest
 
 from runner import status
+from runner.cli import _Screen
 from runner.status import StatusLine
 from tests.runner.experiment.experiment_rig import experiment_file
 
@@ -223,3 +225,10 @@ def test_the_time_left_follows_the_pace(monkeypatch: pytest.MonkeyPatch) -> None
     clock[0], line.fraction = 130.0, 0.25
     assert line.left() == "1:30"
     assert status.duration(3723) == "1:02:03"
+
+
+def test_a_warning_about_data_is_written_once(capsys: pytest.CaptureFixture[str]) -> None:
+    screen = _Screen()
+    for name in ("ident.estimation.identify", "ident.rows.prepare", "fri.pc", "fri.pc"):
+        screen.handle(logging.LogRecord(name, logging.WARNING, "", 0, "%s: jumps", (name[:5],), None))
+    assert capsys.readouterr().err.split("\n")[:-1] == ["ident: jumps", "fri.p: jumps", "fri.p: jumps"]
