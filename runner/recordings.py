@@ -91,6 +91,7 @@ def read_recordings(
     from ident.dynamics.session_chain import recorded_rests
     from ident.import_log import Guess, Known, guess_mapping, import_log, read_recording
     from ident.import_log.bag import bag_files
+    from ident.import_log.tables import unpacked
     from lwr_driver.session import read_session
 
     named = () if joints is None else tuple(name.strip() for name in joints.split(","))
@@ -123,7 +124,7 @@ def read_recordings(
         _same_rests(guess.mapping.held or {}, guess_mapping(other, urdf, known).mapping.held or {}, other)
     _confirm(guess, yes)
     folder.mkdir(parents=True, exist_ok=True)
-    mapping = folder / f"{foreign[0].stem}.mapping.yaml"
+    mapping = folder / f"{unpacked(foreign[0]).stem}.mapping.yaml"
     if mapping.exists() and not mapping.read_text(encoding="utf-8").startswith(Guess.HEAD):
         raise ConfigurationError(
             f"{mapping} exists and was not guessed; use it with `lwr-run import`, or remove it"
@@ -182,10 +183,12 @@ def _confirm(guess: Guess, yes: bool) -> None:
 
 def _names(paths: Sequence[Path]) -> list[str]:
     """Names of the session logs: that of the recording, with its folder's where two are alike."""
-    stems = [path.stem for path in paths]
+    from ident.import_log.tables import unpacked
+
+    stems = [unpacked(path).stem for path in paths]
     return [
-        path.stem if stems.count(path.stem) == 1 else f"{path.resolve().parent.name}_{path.stem}"
-        for path in paths
+        stem if stems.count(stem) == 1 else f"{path.resolve().parent.name}_{stem}"
+        for path, stem in zip(paths, stems, strict=True)
     ]
 
 

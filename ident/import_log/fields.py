@@ -15,7 +15,7 @@ import numpy as np
 
 from fri.errors import DataError
 from ident.import_log.recording import Recording
-from ident.import_log.tables import ARCHIVES, Floats
+from ident.import_log.tables import ARCHIVES, Floats, unpacked
 
 
 def _words(text: str) -> frozenset[str]:
@@ -132,7 +132,11 @@ def fields(recording: Recording, joints: Sequence[str]) -> list[Field]:
     """The fields of a recording. joints : names of the URDF's joints, looked for in the names of columns."""
     if not recording.source.is_dir():
         return list(_in_file(recording, None, joints))
-    files = sorted(p.name for p in recording.source.iterdir() if p.suffix.lower() in TEXTS | ARCHIVES)
+    files = sorted(
+        p.name
+        for p in recording.source.iterdir()
+        if p.suffix.lower() in ARCHIVES or unpacked(p).suffix.lower() in TEXTS
+    )
     if not files:
         raise DataError(
             f"{recording.source}: a folder without recordings; known are {', '.join(sorted(TEXTS | ARCHIVES))}, and "
@@ -149,7 +153,7 @@ def _in_file(recording: Recording, file: str | None, joints: Sequence[str]) -> I
             continue
         names = table.names
         unnamed = names == tuple(str(k + 1) for k in range(len(names)))
-        name = array or path.stem
+        name = array or unpacked(path).stem
         if unnamed:
             if array and values.shape[0] < values.shape[1]:
                 values = values.T
@@ -175,7 +179,7 @@ def _in_file(recording: Recording, file: str | None, joints: Sequence[str]) -> I
             )
             # `Joint_1` in `position.csv`: the file says which quantity.
             if one.quantity is None and not set(one.words) & _ASIDE:
-                one = replace(one, name=f"{path.stem} {stem}")
+                one = replace(one, name=f"{unpacked(path).stem} {stem}")
             yield one
 
 
@@ -184,7 +188,7 @@ def _one_a_joint(found: list[Field], joints: Sequence[str]) -> list[Field]:
     groups: dict[str, list[tuple[str, Field]]] = {}
     kept: list[Field] = []
     for one in found:
-        stem, label = split_name(Path(str(one.file)).stem, joints)
+        stem, label = split_name(unpacked(Path(str(one.file))).stem, joints)
         if one.values.shape[1] == 1 and label and one.columns == (1,):
             groups.setdefault(stem, []).append((label, one))
         else:

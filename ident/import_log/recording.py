@@ -132,7 +132,8 @@ class Recording:
 
     def _digest(self, path: Path) -> None:
         try:
-            self._digests[path] = hashlib.sha256(path.read_bytes()).hexdigest()
+            with path.open("rb") as file:
+                self._digests[path] = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
             raise DataError(f"{path}: cannot be read: {error.strerror}") from error
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import lzma
 import math
 import zipfile
+import zlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +23,14 @@ Floats = NDArray[np.float64]
 _COMMENTS = ("#", "%")
 # Beginning of a text that shows its layout, and longest part of it in memory.
 _HEAD_BYTES, _BATCH_BYTES = 2**20, 2**23
+# First bytes of compressed files.
+_UNPACK: dict[bytes, Callable[[Path], Any]] = {
+    b"\x1f\x8b": gzip.open,
+    b"BZh": bz2.open,
+    b"\xfd7zXZ\0": lzma.open,
+}
+_PACKED = frozenset({".gz", ".bz2", ".xz"})
+_UNREADABLE = (OSError, EOFError, zlib.error, lzma.LZMAError)
 
 
 @dataclass(frozen=True)
@@ -29,8 +41,14 @@ class Table:
     values: Any
 
 
+def unpacked(path: Path) -> Path:
+    """The name without the suffix of a compression."""
+    return path.with_suffix("") if path.suffix.lower() in _PACKED else path
+
+
 def read_text(path: Path, delimiter: str | None = None, header: bool | None = None) -> Table:
-    """A text table: comma, semicolon, tab or blanks, a decimal comma where the comma separates nothing.
+    """A text table: comma, semicolon, tab or blanks, a decimal comma where the comma separates nothing; plain, or
+    compressed by gzip, bzip2 or xz.
 
     header : whether the first row holds names; None decides by its content. Comment lines begin with # or %; the
     one before the numbers has the names if it has as many words as columns. Rows of words below the names, such as
@@ -90,13 +108,13 @@ def _layout(path: Path, lines: list[str], delimiter: str | None, header: bool | 
 def _long(path: Path, delimiter: str | None, header: bool | None) -> Table | None:
     """A long plain table, batch after batch by pyarrow; None for a short one, and for one it cannot read."""
     try:
-        with path.open("rb") as file:
+        with _opened(path) as file:
             head = file.read(_HEAD_BYTES)
             if len(head) < _HEAD_BYTES:
                 return None
         text = head[: head.rindex(b"\n")].decode("utf-8-sig")
         layout = _layout(path, text.splitlines(), delimiter, header)
-    except (OSError, ValueError, DataError):
+    except (*_UNREADABLE, ValueError, DataError):
         # The slow way says what is wrong.
         return None
     numbers = layout.rows[0][1]
@@ -108,30 +126,42 @@ def _long(path: Path, delimiter: str | None, header: bool | None) -> Table | Non
     names = list(_numbers(layout.width))
     found = Growing()
     try:
-        with csv.open_csv(
-            path,
-            read_options=csv.ReadOptions(
-                column_names=names,
-                skip_rows=layout.rows[0][0] - 1,
-                block_size=_BATCH_BYTES,
-                use_threads=False,
-            ),
-            parse_options=csv.ParseOptions(delimiter=layout.mark),
-            convert_options=csv.ConvertOptions(
-                column_types=dict.fromkeys(names, float64()), null_values=[], decimal_point=decimal
-            ),
-        ) as batches:
+        with (
+            _opened(path) as file,
+            csv.open_csv(
+                file,
+                read_options=csv.ReadOptions(
+                    column_names=names,
+                    skip_rows=layout.rows[0][0] - 1,
+                    block_size=_BATCH_BYTES,
+                    use_threads=False,
+                ),
+                parse_options=csv.ParseOptions(delimiter=layout.mark),
+                convert_options=csv.ConvertOptions(
+                    column_types=dict.fromkeys(names, float64()), null_values=[], decimal_point=decimal
+                ),
+            ) as batches,
+        ):
             for batch in batches:
                 found.append(np.column_stack([column.to_numpy() for column in batch.columns]))
-    except (ArrowException, ValueError):
+    except (*_UNREADABLE, ArrowException, ValueError):
         return None
     return Table(layout.names or _numbers(layout.width), found.array())
 
 
+def _opened(path: Path) -> IO[bytes]:
+    """The bytes of a text file, unpacked where its first bytes say so."""
+    with path.open("rb") as file:
+        head = file.read(max(map(len, _UNPACK)))
+    unpack = next((unpack for magic, unpack in _UNPACK.items() if head.startswith(magic)), None)
+    return path.open("rb") if unpack is None else unpack(path)
+
+
 def _lines(path: Path) -> list[str]:
     try:
-        data = path.read_bytes()
-    except OSError as error:
+        with _opened(path) as file:
+            data = file.read()
+    except _UNREADABLE as error:
         raise DataError(f"{path}: not readable as text: {error}") from error
     for encoding in ("utf-16",) if data[:2] in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "cp1252"):
         try:

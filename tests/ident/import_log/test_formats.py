@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import lzma
 import re
 from pathlib import Path
 from typing import Any
@@ -14,8 +17,10 @@ from mcap_ros2.writer import Writer
 from scipy.io import savemat
 
 from fri.errors import ConfigurationError, DataError
-from ident.import_log import LogMapping, import_log
+from ident.import_log import LogMapping, import_log, tables
 from ident.import_log.bag import read_bag
+from ident.import_log.fields import fields
+from ident.import_log.recording import Recording
 from ident.import_log.tables import read_text
 from lwr_driver.configuration import parse
 from lwr_driver.session import read_session
@@ -133,6 +138,33 @@ def test_text_tables_of_every_habit(
         table = read_text(tmp_path / "a.txt")
         assert table.names == names
         assert table.values[0].tolist() == first
+
+
+@pytest.mark.parametrize(("pack", "suffix"), [(gzip, ".gz"), (bz2, ".bz2"), (lzma, ".xz"), (gzip, "")])
+@pytest.mark.parametrize("rows", [3, 200_000])
+def test_compressed_text_is_read_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pack: Any, suffix: str, rows: int
+) -> None:
+    path = tmp_path / f"a.csv{suffix}"
+    path.write_bytes(pack.compress(b"a,b\n" + b"1.5,-2\n" * rows))
+    if rows > 3:
+        # A long one in batches, never whole.
+        monkeypatch.setattr(tables, "_lines", None)
+    table = read_text(path)
+    assert table.names == ("a", "b")
+    np.testing.assert_array_equal(table.values, [[1.5, -2.0]] * rows)
+
+
+def test_a_folder_of_compressed_text_is_a_recording_and_half_a_file_none(tmp_path: Path) -> None:
+    write_csv(tmp_path)
+    plain = tmp_path / "arm.csv"
+    packed = tmp_path / "arm.csv.gz"
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    plain.unlink()
+    assert {one.shown for one in fields(Recording(tmp_path), ())} >= {"arm.csv.gz qa", "arm.csv.gz t"}
+    packed.write_bytes(packed.read_bytes()[:-20])
+    with pytest.raises(DataError, match=r"arm\.csv\.gz: not readable as text: Compressed file ended"):
+        read_text(packed)
 
 
 def test_a_column_of_words_does_not_keep_the_others_from_being_read(tmp_path: Path) -> None:
