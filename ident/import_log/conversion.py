@@ -24,6 +24,10 @@ from lwr_driver.configuration import find, yaml_text
 from lwr_driver.session import SessionWriter, session_metadata
 
 _ONCE = ("position", "velocity", "joint_torque")
+# Signals of one topic: their rows are written or left out together.
+_TOPICS = (_ONCE, ("motor_torque", "motor_position"), ("command",))
+MOST_MISSING = 0.5
+"""Largest share of rows without one of their values; the rest is no recording of the motion."""
 # Share of the motion that marks may leave out unasked: without it standard deviations grow by 5 %.
 _LOST = 0.1
 
@@ -35,6 +39,7 @@ class ImportReport:
     rows : samples written of each topic. rows_in_source : samples of the recording.
     period_s, shortest_s, longest_s : median, least and greatest time between samples of `/joint_states` [s].
     unwrapped : angles that wrapped, and where.
+    left_out : rows without one of their values, by topic; they count as lost samples.
     holes : intervals longer than 1.75 periods, probably with lost samples.
     repeated : samples equal to the one before in every value; they are kept.
     periods : of the excitation, marked in the session; None for a motion without.
@@ -54,6 +59,7 @@ class ImportReport:
     holes: int
     repeated: int
     unwrapped: tuple[str, ...]
+    left_out: tuple[str, ...]
     periods: Periods | None
     notes: tuple[str, ...]
     conversions: tuple[str, ...]
@@ -74,6 +80,7 @@ class ImportReport:
             f"{self.longest_s * 1e3:.4g} ms, {jitter}",
             *(lost if self.holes else ()),
             *(again if self.repeated else ()),
+            *(f"  left out  {missing}" for missing in self.left_out),
             *(f"  unwrapped {turned}" for turned in self.unwrapped),
             *((f"  periods   {self.periods}",) if self.periods is not None else ()),
             *(f"  note      {note}" for note in self.notes),
@@ -113,7 +120,9 @@ def import_log(
     beside : folder of the mapping file, for its URDF.
 
     The session's uid follows from the content of the files and the rows taken, so a second import of the same
-    recording is recognised. Raises DataError with file, column and row for non-finite values, times that do not
+    recording is recognised. A row without one of its values is left out of its topic, like a lost sample.
+
+    Raises DataError with file, column and row where more than half of the rows are without, for times that do not
     increase, files of unequal length or missing columns; ConfigurationError for an existing output, and for joints
     or links that the URDF does not have.
     """
@@ -123,7 +132,7 @@ def import_log(
     base, tip = base or mapping.base, tip or mapping.tip
     described, notes = _described(mapping, urdf, base, tip, beside)
     recording = Recording(source, mapping.delimiter, mapping.header, notes=notes)
-    total, channels, turned = _read(mapping, recording, rows)
+    total, channels, turned, missing = _read(mapping, recording, rows)
     joint = channels["position"]
     digest = hashlib.sha256(
         repr((sorted(recording.digests.values()), rows, mapping.joints)).encode()
@@ -187,6 +196,7 @@ def import_log(
         holes=int(np.count_nonzero(steps > 1.75 * np.median(steps))),
         repeated=_repeated(channels),
         unwrapped=tuple(turned),
+        left_out=tuple(missing),
         periods=periods,
         notes=(*recording.notes, *_strange_rate(float(np.median(steps))), *_jumping(mapping, joint)),
         conversions=_conversions(mapping),
@@ -257,11 +267,14 @@ def _described(
 
 def _read(
     mapping: LogMapping, recording: Recording, rows: tuple[int, int] | None
-) -> tuple[int, dict[str, _Channel], list[str]]:
-    """Rows of the recording, every channel converted to joint side and SI, and sentences about unwrapped angles."""
+) -> tuple[int, dict[str, _Channel], list[str], list[str]]:
+    """Rows of the recording, every channel converted to joint side and SI, and sentences about unwrapped angles and
+    rows left out."""
     first = 0 if rows is None else rows[0]
     raws: dict[str, Floats] = {}
+    seconds: dict[str, Floats] = {}
     clocks: dict[str, NDArray[np.int64]] = {}
+    missing: list[str] = []
     total = 0
     for name, signal in mapping.signals.items():
         raw = recording.columns(signal, mapping.joints, name)
@@ -273,9 +286,28 @@ def _read(
             raise DataError(
                 f"{place} has {len(raw)} rows, the positions have {total}; the recording is not whole"
             )
-        raws[name] = _cut(raw, rows, place)
-        _refuse_non_finite(raws[name], mapping.joints, place, first)
-        clocks[name] = _nanoseconds(base, _cut(clock, rows, place), place, first, recording.notes)
+        raws[name], seconds[name] = _cut(raw, rows, place), _cut(clock, rows, place)
+    for topic in _TOPICS:
+        names = [name for name in topic if name in raws]
+        if not names:
+            continue
+        if len({len(raws[name]) for name in names}) > 1:
+            sizes = ", ".join(f"`{name}` {len(raws[name])}" for name in names)
+            raise DataError(f"{recording.source}: rows of one topic are of unequal number: {sizes}")
+        timed = np.logical_and.reduce([np.isfinite(seconds[name]) for name in names])
+        whole = np.logical_and.reduce([timed, *(np.isfinite(raws[name]).all(axis=1) for name in names)])
+        if not whole.all():
+            place = str(recording.path(_one(mapping.signals[names[0]].file)))
+            parts = {f"`{name}`": raws[name] for name in names}
+            parts |= {f"the time of `{name}`": seconds[name][:, None] for name in names}
+            missing.append(_left_out(whole, parts, mapping.joints, place, first))
+        for name in names:
+            place = f"{recording.path(_one(mapping.signals[name].file))}: `{name}`"
+            base, numbers = _base(mapping, name), first + np.flatnonzero(timed)
+            times = _nanoseconds(base, seconds[name][timed], place, numbers, recording.notes)
+            if not whole.all():
+                times, raws[name] = times[whole[timed]], raws[name][whole]
+            clocks[name] = times
     if len(raws["position"]) < 2:
         raise DataError(f"{recording.source}: {len(raws['position'])} samples are no motion; two at least")
     free = [clocks[name] for name in clocks if _origin_ns(mapping, _base(mapping, name)) is None]
@@ -306,7 +338,31 @@ def _read(
                     f"{name} of {own}: {steps} of 360 deg in one sample taken back, first at {since:.4g} s"
                 )
         channels[name] = _Channel(times, published - min(0, int(published[0])), values)
-    return total, channels, turned
+    return total, channels, turned, missing
+
+
+def _left_out(
+    whole: NDArray[np.bool_], values: Mapping[str, Floats], joints: tuple[str, ...], place: str, first: int
+) -> str:
+    """What to say of the rows (n,) that are not whole. DataError if they are more than half.
+
+    values : (n, joints) or (n, 1) by what they are. first : number of the first row.
+    """
+    counts = {name: np.count_nonzero(~np.isfinite(own), axis=0) for name, own in values.items()}
+    listed = ", ".join(
+        name if bad.all() else f"{name} of {', '.join(joints[k] for k in np.flatnonzero(bad))}"
+        for name, bad in counts.items()
+        if bad.any()
+    )
+    count, row = int((~whole).sum()), first + int(np.argmin(whole))
+    share = f"{count} of {len(whole)} rows ({100.0 * count / len(whole):.3g} %)"
+    if count > MOST_MISSING * len(whole):
+        raise DataError(
+            f"{place}: {share} are without one of their values, first row {row} ({listed}); at most "
+            f"{100.0 * MOST_MISSING:g} % may be: take other columns in the mapping, or a part of the recording with "
+            "`--rows` of `lwr-run import`"
+        )
+    return f"{share} without one of their values, first row {row} ({listed}); they count as lost samples"
 
 
 def _base(mapping: LogMapping, name: str) -> TimeBase:
@@ -358,14 +414,9 @@ def _clock(base: TimeBase, signal: Signal, recording: Recording, count: int, pla
 
 
 def _nanoseconds(
-    base: TimeBase, clock: Floats, place: str, first: int, notes: list[str]
+    base: TimeBase, clock: Floats, place: str, numbers: NDArray[np.int64], notes: list[str]
 ) -> NDArray[np.int64]:
-    """Times [ns] by the source's clock, strictly increasing. DataError with the rows otherwise."""
-    if not np.isfinite(clock).all():
-        row = int(np.flatnonzero(~np.isfinite(clock))[0])
-        raise DataError(
-            f"{place}: time in row {first + row} is {clock[row]}; a log needs the time of every sample"
-        )
+    """Times [ns] by the source's clock, strictly increasing. DataError with the numbers of the rows otherwise."""
     # Whole seconds and the rest apart: a double holds unix time to 0.2 us only once, not twice.
     whole = np.floor(clock)
     times = whole.astype(np.int64) * 10**9 + np.rint((clock - whole) * 1e9).astype(np.int64)
@@ -386,7 +437,7 @@ def _nanoseconds(
             else "repair the clock of the recording"
         )
         raise DataError(
-            f"{place}: time {clock[row + 1]:.9g} s in row {first + row + 1} follows {clock[row]:.9g} s; "
+            f"{place}: time {clock[row + 1]:.9g} s in row {numbers[row + 1]} follows {clock[row]:.9g} s; "
             f"times must increase ({len(backwards)} such rows); {advice}, or import without it by `rate_hz`"
         )
     return times
@@ -429,17 +480,6 @@ def _cut(values: Floats, rows: tuple[int, int] | None, place: str) -> Floats:
     if not 0 <= first < last <= len(values):
         raise DataError(f"{place}: rows {first}:{last} asked for, the recording has 0:{len(values)}")
     return values[first:last]
-
-
-def _refuse_non_finite(values: Floats, joints: tuple[str, ...], place: str, first: int) -> None:
-    bad = ~np.isfinite(values)
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
-        raise DataError(
-            f"{place} of {joints[column]!r} is {values[row, column]} in row {first + row} "
-            f"({int(bad.sum())} such values); leave these rows out with "
-            "`--rows`, a session holds measured values only"
-        )
 
 
 def _convert(

@@ -15,7 +15,7 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.session_chain import AS_RECORDED
 from ident.dynamics.urdf import Urdf, read_urdf
 from ident.import_log.bag import Bag, bag_files, read_bag
-from ident.import_log.conversion import import_log
+from ident.import_log.conversion import MOST_MISSING, import_log
 from ident.import_log.mapping import LogMapping, Signal, TimeBase, Unit
 from ident.import_log.rests import rests, without_gripper
 from lwr_driver.session import Session, read_session
@@ -40,7 +40,7 @@ def read_recording(
 
     From a bag, the topic of `sensor_msgs/JointState` with most arrays and joints is taken, `effort` as joint torque,
     header stamps as times if they rise with every message, else the recorder's times, equal ones spread. Joints with
-    values missing are left out.
+    most values missing are left out.
     motor : whether `effort` of a bag is the motors' torque, already at the joint, instead of the sensors'.
     joints : those of a bag that are the model's; others that act on them are held where they rest. Without, all, but a
         gripper at rest at the end of the arm.
@@ -70,8 +70,8 @@ def read_recording(
         target = Path(folder) / f"{source.stem}.mcap"
         report = import_log(mapping, source, target, urdf=None)
         session = read_session(target, status=status)
-    for turned in report.unwrapped:
-        logger.warning("%s: %s", source.name, turned)
+    for said in (*report.unwrapped, *report.left_out):
+        logger.warning("%s: %s", source.name, said)
     more = {"robot": "" if robot is None else robot.name, **({} if chosen else {"joints": AS_RECORDED})}
     metadata = {**session.metadata, **more}
     return replace(session, path=source, metadata=metadata, robot_description=bag.robot_description)
@@ -82,6 +82,7 @@ def _of_arm(
 ) -> LogMapping:
     """The mapping for the joints of an arm, others held where they rest."""
     names, position = bag.states[0].names, bag.states[0].values["position"]
+    position = position[np.isfinite(position[:, [names.index(name) for name in mapping.joints]]).all(axis=1)]
     if not joints:
         known = {joint.name for joint in robot.joints if joint.movable}
         try:
@@ -106,7 +107,7 @@ def _with(mapping: LogMapping, bag: Bag, joints: tuple[str, ...], held: dict[str
     missing = [name for name in joints if name not in mapping.joints]
     if missing:
         raise ConfigurationError(
-            f"{bag.path}: {bag.states[0].topic} has no joint {missing[0]!r} with all its values; it has "
+            f"{bag.path}: {bag.states[0].topic} has no joint {missing[0]!r} with its values; it has "
             f"{', '.join(mapping.joints)}"
         )
     signals = {name: replace(signal, columns=joints) for name, signal in mapping.signals.items()}
@@ -121,10 +122,11 @@ def bag_mapping(bag: Bag, *, motor: bool = False) -> LogMapping:
         raise DataError(
             f"{bag.path}: no topic has `position` and `effort` ({found}); torques must be recorded"
         )
-    whole = np.all([np.isfinite(values).all(axis=0) for values in states.values.values()], axis=0)
+    there = [np.isfinite(values).mean(axis=0) >= 1.0 - MOST_MISSING for values in states.values.values()]
+    whole = np.all(there, axis=0)
     joints = tuple(name for name, good in zip(states.names, whole, strict=True) if good)
     if not joints:
-        raise DataError(f"{bag.path}: {states.topic} has missing values (nan) in every joint")
+        raise DataError(f"{bag.path}: {states.topic} has most values missing (nan) in every joint")
     units: dict[str, Unit] = {"position": "rad", "velocity": "rad/s", "effort": "Nm"}
     signals: dict[str, Any] = {
         name: Signal(unit, array=f"{states.topic}/{name}", columns=joints)

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.urdf import Urdf, read_urdf
+from ident.import_log.conversion import MOST_MISSING
 from ident.import_log.fields import Field, fields
 from ident.import_log.mapping import LogMapping, Signal, TimeBase, Transmission, Unit
 from ident.import_log.rates import ALIKE, Rates, compare
@@ -106,7 +108,7 @@ class _Guesser:
         self.source, self.urdf, self.known = source, urdf, known
         self.robot: Urdf = read_urdf(urdf)
         movable = [joint.name for joint in self.robot.joints if joint.movable]
-        self.fields = fields(Recording(source), movable)
+        self.fields, self.numbers = _whole_rows(fields(Recording(source), movable))
         self.why: dict[str, str] = {}
         if len(self.fields) == 1 and not any(self.fields[0].labels) and self.fields[0].array is None:
             self.fields = self._blocks(self.fields[0])
@@ -130,8 +132,9 @@ class _Guesser:
         bad = np.flatnonzero(~np.isfinite(position.values).all(axis=1))
         if len(bad):
             raise DataError(
-                f"{self.source}: {position.shown} has missing values in {_rows(len(bad))}, first in row {bad[0]}; "
-                "write a mapping file and leave them out with `lwr-run import --rows`"
+                f"{self.source}: {position.shown} has missing values in {_rows(len(bad))} of {len(position.values)}, "
+                f"first in row {bad[0]}; at most {100.0 * MOST_MISSING:g} % may be: take other columns, or import "
+                "a part with `lwr-run import --rows`, each with a mapping file"
             )
         unit, reason = self._angle_unit(position, joints)
         size = math.pi / 180.0 if unit == "deg" else 1.0
@@ -207,7 +210,8 @@ class _Guesser:
         bad = np.flatnonzero(~np.isfinite(velocity.values).all(axis=1))
         if not len(bad):
             return velocity
-        self.reasons[velocity.name] = f"missing values in {_rows(len(bad))}, first in row {bad[0]}"
+        row = self.numbers[len(velocity.values)][bad[0]]
+        self.reasons[velocity.name] = f"missing values in {_rows(len(bad))}, first in row {row}"
         return None
 
     def _name_columns(self, count: int) -> None:
@@ -424,7 +428,7 @@ class _Guesser:
             )
         elif current is not None and self.known.torque_constant and "motor_torque" not in found:
             constant = _each("torque_constant", self.known.torque_constant, joints)
-            large = bool(np.abs(current.values).max() > _LARGEST_CURRENT_A)
+            large = bool(np.nanmax(np.abs(current.values)) > _LARGEST_CURRENT_A)
             unit = "mA" if large or "ma" in current.words else "A"
             found["motor_torque"] = self._take("motor_torque", current, unit, "a current", constant)
         if not found and current is not None:
@@ -486,6 +490,27 @@ class _Guesser:
             else []
         )
         return [*times, *found, replace(parts[0], name="torque")]
+
+
+def _whole_rows(found: list[Field]) -> tuple[list[Field], dict[int, NDArray[np.int64]]]:
+    """The fields without the rows that miss a position or a time, and by the number of rows left their numbers.
+
+    Rows stay where half of them would not.
+    """
+    told = [one for one in found if one.quantity in ("position", "time")] or found
+    kept: dict[int, NDArray[np.int64]] = {}
+    for count in {len(one.values) for one in found}:
+        there = [np.isfinite(one.values) for one in told if len(one.values) == count]
+        columns = [own[:, own.mean(axis=0) >= 1.0 - MOST_MISSING] for own in there]
+        whole = np.logical_and.reduce([np.ones(count, dtype=bool), *(own.all(axis=1) for own in columns)])
+        kept[count] = np.flatnonzero(whole) if whole.mean() >= 1.0 - MOST_MISSING else np.arange(count)
+    left = [
+        one
+        if len(kept[len(one.values)]) == len(one.values)
+        else replace(one, values=one.values[kept[len(one.values)]])
+        for one in found
+    ]
+    return left, {len(numbers): numbers for numbers in kept.values()}
 
 
 def _rows(count: int) -> str:

@@ -21,6 +21,7 @@ from lwr_driver.session.spool import Growing
 
 Floats = NDArray[np.float64]
 _COMMENTS = ("#", "%")
+_MISSING = ("", "NA", "N/A", "null", "NULL", "None")
 # Beginning of a text that shows its layout, and longest part of it in memory.
 _HEAD_BYTES, _BATCH_BYTES = 2**20, 2**23
 # First bytes of compressed files.
@@ -52,7 +53,8 @@ def read_text(path: Path, delimiter: str | None = None, header: bool | None = No
 
     header : whether the first row holds names; None decides by its content. Comment lines begin with # or %; the
     one before the numbers has the names if it has as many words as columns. Rows of words below the names, such as
-    units, are passed over, and a column that begins with a word is nan. DataError with line and column.
+    units, are passed over, and a column that begins with a word is nan. So is a missing value: an empty cell, or a word
+    that other programs write for it. DataError with line and column.
     """
     long = _long(path, delimiter, header)
     if long is not None:
@@ -62,9 +64,10 @@ def read_text(path: Path, delimiter: str | None = None, header: bool | None = No
     values = _fast(rows, mark, width)
     if values is None:
         values = np.empty((len(rows), width))
-        words = {k for k, part in enumerate(_split(rows[0][1], mark)) if part and not _is_number(part)}
+        first = _split(rows[0][1], mark, width)
+        words = {k for k, part in enumerate(first) if part not in _MISSING and not _is_number(part)}
         for index, (number, line) in enumerate(rows):
-            parts = _split(line, mark)
+            parts = _split(line, mark, width)
             values[index] = _row(path, number, parts, width, layout.names, words if layout.named else set())
     return Table(layout.names or _numbers(width), values)
 
@@ -138,12 +141,16 @@ def _long(path: Path, delimiter: str | None, header: bool | None) -> Table | Non
                 ),
                 parse_options=csv.ParseOptions(delimiter=layout.mark),
                 convert_options=csv.ConvertOptions(
-                    column_types=dict.fromkeys(names, float64()), null_values=[], decimal_point=decimal
+                    column_types=dict.fromkeys(names, float64()),
+                    null_values=list(_MISSING),
+                    decimal_point=decimal,
                 ),
             ) as batches,
         ):
             for batch in batches:
-                found.append(np.column_stack([column.to_numpy() for column in batch.columns]))
+                found.append(
+                    np.column_stack([column.to_numpy(zero_copy_only=False) for column in batch.columns])
+                )
     except (*_UNREADABLE, ArrowException, ValueError):
         return None
     return Table(layout.names or _numbers(layout.width), found.array())
@@ -188,9 +195,10 @@ def _fast(rows: list[tuple[int, str]], mark: str | None, width: int) -> Floats |
     return values if values.shape == (len(rows), width) else None
 
 
-def _split(line: str, mark: str | None) -> list[str]:
-    parts = [part.strip().strip('"') for part in line.strip().split(mark)]
-    return parts[:-1] if len(parts) > 1 and parts[-1] == "" else parts
+def _split(line: str, mark: str | None, width: int = 1) -> list[str]:
+    """The cells of a line, without an empty one behind the `width` that it has at least."""
+    parts = [part.strip().strip('"') for part in line.strip(" \r\n" if mark == "\t" else None).split(mark)]
+    return parts[:-1] if len(parts) > width and parts[-1] == "" else parts
 
 
 def _is_number(text: str) -> bool:
@@ -204,20 +212,19 @@ def _is_number(text: str) -> bool:
 def _row(
     path: Path, number: int, parts: list[str], width: int, names: tuple[str, ...], words: Collection[int]
 ) -> list[float]:
-    """The numbers of a row; those of the columns `words` are nan."""
+    """The numbers of a row; those missing and of the columns `words` are nan."""
     if len(parts) != width:
         raise DataError(
             f"{path}: line {number} has {len(parts)} columns, the first has {width}; the file is not whole"
         )
     values = []
     for index, part in enumerate(parts):
-        if index in words:
+        if index in words or part in _MISSING:
             values.append(math.nan)
             continue
         if not _is_number(part):
             column = names[index] if names else str(index + 1)
-            shown = "is empty" if not part else f"holds {part!r}"
-            raise DataError(f"{path}: line {number}, column {column!r} {shown}; a number is needed")
+            raise DataError(f"{path}: line {number}, column {column!r} holds {part!r}; a number is needed")
         values.append(float(part))
     return values
 

@@ -6,6 +6,7 @@ import bz2
 import gzip
 import lzma
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from scipy.io import savemat
 from fri.errors import ConfigurationError, DataError
 from ident.import_log import LogMapping, import_log, tables
 from ident.import_log.bag import read_bag
+from ident.import_log.direct import bag_mapping
 from ident.import_log.fields import fields
 from ident.import_log.recording import Recording
 from ident.import_log.tables import read_text
@@ -171,7 +173,7 @@ def test_a_column_of_words_does_not_keep_the_others_from_being_read(tmp_path: Pa
     write_csv(tmp_path, mode=["run", "run", "stop", "run"])
     _, session = imported(tmp_path, tmp_path, mapping())
     assert len(session.joint) == 4
-    with pytest.raises(DataError, match="is nan in row 0"):
+    with pytest.raises(DataError, match=r"100 %.*`position` of b"):
         import_log(
             mapping(position=PLAIN["position"] | {"columns": ["qa", "mode"]}), tmp_path, tmp_path / "y.mcap"
         )
@@ -304,6 +306,15 @@ def test_a_bag_is_read_by_the_names_in_each_message(tmp_path: Path) -> None:
     assert arm.clock == "stamp"
     assert (fingers.names, tuple(fingers.values)) == (("f1", "f2"), ("position",))
     assert bag.robot_description == stock_panda()
+
+
+def test_a_joint_of_a_bag_stays_with_half_of_its_values(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag.mcap")
+    bag = read_bag(tmp_path / "bag.mcap")
+    values = {name: own.copy() for name, own in bag.states[0].values.items()}
+    values["position"][: N // 2, 1] = values["effort"][: N // 2 + 1, 3] = np.nan
+    holed = replace(bag, states=(replace(bag.states[0], values=values),))
+    assert bag_mapping(holed).joints == tuple(name for k, name in enumerate(JOINTS) if k != 3)
 
 
 def test_a_bag_is_imported_through_a_mapping(tmp_path: Path) -> None:

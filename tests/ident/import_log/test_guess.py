@@ -304,6 +304,29 @@ def test_a_velocity_left_out_is_followed_by_the_reason(arm: Path, tmp_path: Path
         assert f"not used: dq1 ... dq7 ({reason})" in str(guess)
 
 
+def test_rows_without_a_position_or_a_time_do_not_keep_the_others_from_the_guess(
+    arm: Path, tmp_path: Path
+) -> None:
+    names = ["t", *columns("q{k}"), *columns("dq{k}"), *columns("tau{k}")]
+    q, t, qd = Q.copy(), T.copy(), QD.copy()
+    q[5:300:7, 2] = t[11] = qd[13, 1] = np.nan
+    path = write(tmp_path / "run.csv", names, t, q, qd, TAU)
+    guess = guess_mapping(path, arm)
+    assert guess.unused == ("dq1 ... dq7 (missing values in 1 row, first in row 13)",)
+    report = import_log(guess.mapping, path, tmp_path / "x.mcap")
+    (said,) = report.left_out
+    assert "first row 5 (" in said
+    whole = np.column_stack([T, Q, TAU])
+    whole[5:300:7] = np.nan
+    np.savetxt(tmp_path / "run.txt", whole)
+    assert guess_mapping(tmp_path / "run.txt", arm).mapping.position.columns == tuple(range(2, 9))
+    q[: len(q) // 2 + 1, 2] = np.nan
+    with pytest.raises(
+        DataError, match=r"q7 has missing values in \d+ rows of \d+, first in row 0; at most 50 %"
+    ):
+        guess_mapping(write(tmp_path / "run.csv", names, T, q, QD, TAU), arm)
+
+
 def moving(arm: Path, tmp_path: Path, q: np.ndarray, qd: np.ndarray, t: np.ndarray = T) -> Guess:
     names = ["t", *columns("q{k}"), *columns("dq{k}"), *columns("tau{k}")]
     return guess_mapping(write(tmp_path / "run.csv", names, t, q, qd, TAU), arm)

@@ -15,6 +15,7 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.session_chain import session_chain
 from ident.import_log import LogMapping, import_log
+from ident.import_log.tables import read_text
 from lwr_driver.configuration import CONFIGS, parse
 from lwr_driver.session import read_session
 from runner.cli import main
@@ -188,13 +189,14 @@ def test_the_same_recording_has_the_same_uid_and_other_rows_another(tmp_path: Pa
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"ta": ["1", "nan", "1", "1"]}, r"`joint_torque` of 'a' is nan in row 1 \(1 such values\)"),
-        ({"qb": ["1", "inf", "1", "1"]}, "`position` of 'b' is inf in row 1"),
-        ({"qa": ["1", "", "1", "1"]}, "line 3, column 'qa' is empty"),
+        (
+            {"ta": ["1", "nan", "nan", ""]},
+            r"3 of 4 rows \(75 %\) are without one of their values, first row 1 \(`joint_torque` of a\); at most 50 %",
+        ),
         ({"qa": ["1", "x", "1", "1"]}, "line 3, column 'qa' holds 'x'"),
         ({"t": [0.0, 0.2, 0.1, 0.3]}, "time 0.1 s in row 2 follows 0.2 s"),
         ({"t": [0.0, 0.1, 0.1, 0.3]}, "times must increase"),
-        ({"t": ["0", "nan", "1", "2"]}, "time in row 1 is nan"),
+        ({"t": ["0", "nan", "", "NA"]}, r"3 of 4 rows \(75 %\).*\(the time of `position`, the time of"),
     ],
 )
 def test_bad_rows_are_named(tmp_path: Path, columns: dict[str, Any], message: str) -> None:
@@ -202,6 +204,44 @@ def test_bad_rows_are_named(tmp_path: Path, columns: dict[str, Any], message: st
     with pytest.raises(DataError, match=message):
         import_log(mapping(), tmp_path, tmp_path / "x.mcap")
     assert not (tmp_path / "x.mcap").exists()
+
+
+def test_rows_without_a_value_are_left_out_of_their_topic_and_told(tmp_path: Path) -> None:
+    number = np.arange(12.0)
+    texts = {name: [f"{value:g}" for value in number] for name in ("t", "qa", "qb", "ta", "tb")}
+    texts["qb"][3], texts["ta"][4], texts["ta"][7], texts["tb"][3], texts["t"][9] = "nan", "", "NA", "inf", ""
+    write_csv(tmp_path, 12, **texts)
+    write_csv(tmp_path, 12, name="drive.csv", tb=[*texts["tb"][4:], "", "", "1", "2"])
+    drive = {
+        "file": "drive.csv",
+        "columns": ["ta", "tb"],
+        "unit": "Nm",
+        "time": {"column": "t", "file": "drive.csv"},
+    }
+    report = import_log(mapping(motor_torque=drive), tmp_path, tmp_path / "x.mcap", rows=(1, 12))
+    session = read_session(report.path)
+    kept = [1, 2, 5, 6, 8, 10, 11]
+    np.testing.assert_array_equal(session.joint.log_time * 1e-9, kept)
+    np.testing.assert_array_equal(session.joint.position[:, 1], kept)
+    np.testing.assert_array_equal(session.joint.effort[:, 0], kept)
+    assert session.motor is not None
+    assert len(session.motor) == 9
+    joint, motor = report.left_out
+    assert joint.startswith("4 of 11 rows (36.4 %) without one of their values, first row 3 (")
+    assert "(`position` of b, `joint_torque`, the time of `position`, the time of `joint_torque`)" in joint
+    assert motor.startswith(
+        "2 of 11 rows (18.2 %) without one of their values, first row 8 (`motor_torque` of b)"
+    )
+    assert f"  left out  {joint}\n" in str(report)
+
+
+def test_an_empty_last_cell_is_a_missing_value_in_any_table(tmp_path: Path) -> None:
+    for mark in (",", ";", "\t"):
+        rows = [f"{k}{mark}{mark}{k}" for k in range(3)] + [f"{k}{mark}{k}{mark}" for k in range(3)]
+        for count in (1, 60_000):
+            (tmp_path / "a.csv").write_text("\n".join([f"a{mark}b{mark}c", *(rows * count)]) + "\n")
+            values = read_text(tmp_path / "a.csv").values
+            np.testing.assert_array_equal(np.isnan(values).sum(axis=0), [0, 3 * count, 3 * count])
 
 
 def test_a_short_row_is_an_error(tmp_path: Path) -> None:
