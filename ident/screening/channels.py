@@ -55,6 +55,11 @@ _TURN = 0.02
 _TOGETHER_S = 0.1
 
 
+# Torques of two joints that are one for a part of a session: least time [s], least share, least changes of the value:
+# columns at rest, dead or held have few.
+_COPIED_S, _COPIED, _CHANGES = 1.0, 0.1, 20
+
+
 def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts about the channels of sessions with the joints of `chain`."""
     found = [*_repeated(sessions), *_never_moving(sessions), *_dead(sessions)]
@@ -238,11 +243,17 @@ def _dead(sessions: Sequence[Session]) -> Iterator[Doubt]:
 
 
 def _copied(session: Session) -> Iterator[Doubt]:
-    """Torques or positions of several joints equal to the last bit in every sample, as two sensors never are. Positions
-    of a simulation may be, if its motion asks for them, or if all joints go the same way."""
+    """Torques of several joints equal to the last bit, as two sensors never are, in every sample or a long part of
+    them; or positions in every sample. Positions of a simulation may be, if its motion asks for them, or if all joints
+    go the same way."""
     for channel, columns in _torques(session):
-        for joints in _alike(columns.effort):
+        whole = _alike(columns.effort)
+        for joints in whole:
             yield _copies(session, channel, joints, certain=True)
+        times = np.asarray((columns.log_time - session.joint.log_time[:1]) * 1e-9, dtype=np.float64)
+        for joints, span in _alike_in_part(columns.effort, times):
+            if not any(set(joints) <= set(some) for some in whole):
+                yield _copies(session, channel, joints, certain=True, where=_spans(times, [span]))
     for joints in _alike(session.joint.position):
         if len(joints) == session.joint.position.shape[1]:
             continue
@@ -285,9 +296,31 @@ def _alike(values: Floats) -> list[list[int]]:
     return [joints for joints in groups.values() if len(joints) > 1]
 
 
-def _copies(session: Session, channel: str, joints: Sequence[int], *, certain: bool) -> Doubt:
+def _alike_in_part(values: Floats, times: Floats) -> Iterator[tuple[list[int], tuple[int, int]]]:
+    """Groups of columns that change and are equal, and the first and the last sample: the longest run of each pair."""
+    found: dict[tuple[int, int, bytes], set[int]] = {}
+    least = max(_COPIED_S, _COPIED * float(times[-1] - times[0]))
+    for one in range(values.shape[1] - 1):
+        own = column(values, one)
+        for other in range(one + 1, values.shape[1]):
+            equal = own == column(values, other)
+            bounds = run_bounds(equal)
+            starts, ends = bounds[:-1], bounds[1:] - 1
+            lasting = np.where(equal[starts], times[ends] - times[starts], 0.0)
+            longest = int(np.argmax(lasting))
+            first, last = int(starts[longest]), int(ends[longest])
+            part = own[first : last + 1]
+            if lasting[longest] >= least and np.count_nonzero(np.diff(part)) >= _CHANGES:
+                found.setdefault((first, last, content(part)), set()).update((one, other))
+    for (first, last, _), joints in found.items():
+        yield sorted(joints), (first, last)
+
+
+def _copies(
+    session: Session, channel: str, joints: Sequence[int], *, certain: bool, where: str = "in every sample"
+) -> Doubt:
     names = tuple(session.joint_names[joint] for joint in joints)
-    seen = "read the same to the last bit in every sample"
+    seen = f"read the same to the last bit {where}"
     looks, mend = "one column taken for several joints", "give each joint its own column when importing"
     return Doubt(channel, names, seen, looks, mend, certain, session.path.name)
 

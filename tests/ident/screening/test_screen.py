@@ -265,6 +265,38 @@ def test_a_torque_that_is_a_copy_of_another_joints_is_an_error(pair: list[Sessio
     assert {doubt.looks_like for doubt in silent} == {"a dead sensor"}
 
 
+@pytest.mark.parametrize("side", ["joint", "motor"])
+def test_a_torque_that_is_a_copy_for_a_part_of_a_session_is_told_with_its_time(
+    pair: list[Session], side: str
+) -> None:
+    columns = getattr(pair[1], side)
+    half = len(columns.effort) // 2
+
+    def seen(effort: np.ndarray) -> list[Doubt]:
+        changed = replace(pair[1], **{side: replace(columns, effort=effort)})
+        return [
+            doubt for doubt in check_channels([pair[0], changed], chain()) if "column" in doubt.looks_like
+        ]
+
+    effort = columns.effort.copy()
+    effort[half:, 2] = effort[half:, 3]
+    effort[:half, 5] = effort[:half, 6] = effort[:half, 0]
+    found = {doubt.joints: doubt for doubt in seen(effort)}
+    assert set(found) == {("E1", "A3"), ("A1", "A5", "A6")}
+    start = (columns.log_time[half] - pair[1].joint.log_time[0]) * 1e-9
+    assert f"read the same to the last bit from {start:.1f} to " in found["E1", "A3"].seen
+    assert all(one.certain and one.session == "loaded.mcap" for one in found.values())
+    # Columns at rest, dead, held for long or equal for a moment are no copies.
+    for rest in (0.0, np.repeat(np.arange(10.0), len(effort) // 10 + 1)[: len(effort) - half]):
+        effort = columns.effort.copy()
+        effort[half:, 2] = effort[half:, 3] = rest
+        assert not seen(effort)
+    effort = columns.effort.copy()
+    some = slice(half, half + int(0.09 * len(effort)))
+    effort[some, 2] = effort[some, 3]
+    assert not seen(effort)
+
+
 def test_positions_that_are_a_copy_of_another_joints_are_told(pair: list[Session]) -> None:
     columns = pair[1].joint
     position = columns.position.copy()
