@@ -17,7 +17,7 @@ verdict is by consequence, beside the statistic:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -109,11 +109,13 @@ def check_assumptions(
     *,
     instrumental: Estimate | None = None,
     period_rows: int | None = None,
+    doubted: Collection[str] = (),
 ) -> Assumptions:
     """Verdicts by consequence; p-values corrected for the number of joints and sides (Bonferroni).
 
     instrumental : estimate of the same problem by instrumental variables, for the test of exogeneity.
     period_rows : rows of one period of the excitation, for the test against the repeatability.
+    doubted : as for `weak_parameters`.
     """
     series = _joined(problem, estimate)
     checks = [
@@ -122,7 +124,7 @@ def check_assumptions(
         _equal_variance(series, problem, estimate),
         _normality(series, problem, estimate),
         _exogeneity(series, problem, estimate, instrumental),
-        _condition(problem, estimate),
+        _condition(problem, estimate, doubted),
     ]
     if period_rows is not None:
         checks.append(_lack_of_fit(problem, estimate, period_rows))
@@ -392,11 +394,13 @@ class Weak:
         return f"{self.name} ({self.torque:.2g} Nm in {self.place}, {self.matters:.2g} Nm matters)"
 
 
-def weak_parameters(problem: Problem, estimate: Estimate) -> list[Weak]:
+def weak_parameters(problem: Problem, estimate: Estimate, doubted: Collection[str] = ()) -> list[Weak]:
     """Parameters with a standard deviation that moves a torque by more than what matters, the worst first.
 
     With v the inflation of the variance by the other columns and n independent rows, std^2 mean(w^2) = v sigma^2 / n.
     A condition number shows v alone; more rows make up for it.
+
+    doubted : joints with a wrong channel; what is most uncertain there is so by the fault, not by the motion.
     """
     found: dict[str, Weak] = {}
     for row_class, series in zip(problem.classes, _joined(problem, estimate), strict=True):
@@ -409,11 +413,15 @@ def weak_parameters(problem: Problem, estimate: Estimate) -> list[Weak]:
                 or weak.torque / matters > found[weak.name].torque / found[weak.name].matters
             ):
                 found[weak.name] = weak
-    return sorted(found.values(), key=lambda weak: -weak.torque / weak.matters)
+    wrong = {row_class.label for row_class in problem.classes if row_class.joint in doubted}
+    return sorted(
+        (weak for weak in found.values() if weak.place not in wrong),
+        key=lambda weak: -weak.torque / weak.matters,
+    )
 
 
-def _condition(problem: Problem, estimate: Estimate) -> Check:
-    normalised, weak = problem.normalised_condition, weak_parameters(problem, estimate)
+def _condition(problem: Problem, estimate: Estimate, doubted: Collection[str]) -> Check:
+    normalised, weak = problem.normalised_condition, weak_parameters(problem, estimate, doubted)
     finding = f"{problem.condition:.1f}, columns normalised {normalised:.1f}"
     if weak:
         finding += f"; too uncertain: {', '.join(one.name for one in weak[:8])}"

@@ -36,6 +36,7 @@ from ident.rows.prepared import PreparedSession
 from ident.rows.sessions import payload_name, require
 from ident.rows.shared_rows import marks
 from ident.rows.signal_choice import choose_signals
+from ident.screening.doubts import Doubt, doubted_joints, settle
 from ident.screening.screen import require_sound
 from lwr_driver.listing import Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
@@ -89,11 +90,11 @@ class IdentificationSettings:
 class Known:
     """What an earlier step of the same command knows of its sessions.
 
-    doubts : sentences of their screening. signal_reasons : why the signal settings are as they are, where the data
+    doubts : of their screening. signal_reasons : why the signal settings are as they are, where the data
     chose them.
     """
 
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
     signal_reasons: tuple[str, ...] = ()
 
 
@@ -339,16 +340,24 @@ class Observed:
                     "/joint_command and do not average periods, or choose `wls`"
                 )
             estimate = self.instrumental
+        doubted = doubted_joints(self.known.doubts) | _late_joints(self.prepared)
         assumptions = check_assumptions(
-            problem, plain, instrumental=self.instrumental, period_rows=_common_period(self.prepared)
+            problem,
+            plain,
+            instrumental=self.instrumental,
+            period_rows=_common_period(self.prepared),
+            doubted=doubted,
         )
         essential = None
         if settings.essential is not None and self.full_rank:
             essential = find_essential(problem, estimate, settings.essential, settings.covariance)
-        warnings = [*self.known.doubts, *(text for session in self.prepared for text in session.warnings)]
+        warnings = [
+            *settle(self.known.doubts),
+            *(text for session in self.prepared for text in session.warnings),
+        ]
         warnings += require_plausible(problem, estimate, self.structure.chain.joint_names)
         warnings += payload_warnings(self.sessions, self.payloads, base, estimate, self.structure)
-        warnings += _excitation_warnings(problem, estimate, self.full_rank)
+        warnings += _excitation_warnings(problem, estimate, self.full_rank, doubted)
         return Identification(
             settings=settings,
             structure=self.structure,
@@ -437,7 +446,7 @@ def observed(
         found = require_sound(
             chosen, chain, settings.signals, settings.couplings, motor=needs_motor, recall=recall
         )
-        known = Known(tuple(found))
+        known = Known(found)
     mounted = payloads if settings.model != 3 else [None] * len(payloads)
     base = numeric_base(structure, _conditions(structure, chosen, mounted))
     laws = (settings.coulomb, settings.row_coulomb)
@@ -538,13 +547,21 @@ def _conditions(
     return tuple(found)
 
 
-def _excitation_warnings(problem: Problem, estimate: Estimate, full_rank: bool) -> list[str]:
+def _late_joints(prepared: Sequence[PreparedSession]) -> frozenset[str]:
+    """Joints with a torque that is late by itself."""
+    delays = [delay for session in prepared for delay in (session.joint_delay, session.delay)]
+    return frozenset(joint for delay in delays if delay is not None for joint in delay.apart)
+
+
+def _excitation_warnings(
+    problem: Problem, estimate: Estimate, full_rank: bool, doubted: frozenset[str]
+) -> list[str]:
     if not full_rank:
         named = ", ".join(estimate.prior_only)
         return [
             f"the motion does not determine all parameters: it does not show {named}, known from the prior alone"
         ]
-    weak = weak_parameters(problem, estimate)
+    weak = weak_parameters(problem, estimate, doubted)
     if not weak:
         return []
     other = ", or use an estimator with a prior" if estimate.prior_scale is None else ""

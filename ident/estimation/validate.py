@@ -376,7 +376,7 @@ def cross_validate(
     if len(sessions) < 2:
         raise DataError(f"{len(sessions)} session cannot be cross-validated; give two at least")
     motor = settings.model != 1
-    doubts = tuple(require_sound(sessions, chain, settings.signals, settings.couplings, motor=motor))
+    doubts = require_sound(sessions, chain, settings.signals, settings.couplings, motor=motor)
     scores, skipped = [], []
     for number, session in enumerate(sessions):
         others = [other for k, other in enumerate(sessions) if k != number]
@@ -394,4 +394,4 @@ def cross_validate(
         skipped += [f"{one}; not scored" for one in fold.unscored]
     if not scores:
         raise DataError("no session can be predicted by the others: " + "; ".join(skipped))
-    return CrossValidation(tuple(scores), tuple(skipped), doubts)
+    return CrossValidation(tuple(scores), tuple(skipped), tuple(settle(doubts)))

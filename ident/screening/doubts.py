@@ -37,6 +37,16 @@ class Doubt:
         return f"{self.subject}: {self.seen}{looks}; {self.mend}"
 
 
+def doubted_joints(doubts: Sequence[Doubt]) -> frozenset[str]:
+    """Joints with a doubt about their torque or position, which both make the residual of their rows."""
+    return frozenset(
+        joint
+        for doubt in doubts
+        if doubt.channel == "position" or "torque" in doubt.channel
+        for joint in doubt.joints
+    )
+
+
 def settle(doubts: Sequence[Doubt]) -> list[str]:
     """Sentences of the doubts for the report. Raises DataError with all of them if one is certain."""
     sentences = list(dict.fromkeys(str(doubt) for doubt in doubts))

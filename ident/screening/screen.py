@@ -171,9 +171,11 @@ def require_sound(
     *,
     motor: bool = True,
     recall: Recall | None = None,
-) -> list[str]:
-    """Sentences of `screen` for the report. Raises DataError when a doubt is certain."""
-    return settle(screen(sessions, chain, signals, couplings, motor=motor, recall=recall))
+) -> tuple[Doubt, ...]:
+    """Doubts of `screen`. Raises DataError when one is certain."""
+    doubts = screen(sessions, chain, signals, couplings, motor=motor, recall=recall)
+    settle(doubts)
+    return doubts
 
 
 def _silent(sessions: Sequence[Session]) -> frozenset[Class]:

@@ -178,4 +178,7 @@ def test_a_condition_number_counts_where_a_torque_is_uncertain(
         size = np.sqrt(np.mean(case.groups[0].matrix[:, case.names.index(first.name)] ** 2))
         assert first.torque == pytest.approx(estimate.std[case.names.index(first.name)] * size)
         assert first.torque > first.matters
+        assert weak_parameters(case, estimate, {"A1"}) == []
+        assert check_assumptions(case, estimate, doubted={"A1"})["condition number"].holds
+        assert len(weak_parameters(case, estimate, {"A2"})) == 2
     assert (check.statistic > 25.0) == (apart == 0.05)

@@ -539,8 +539,8 @@ def test_a_log_given_twice_is_known_by_uid_and_by_content(pair: list[Session]) -
 def test_two_recordings_with_one_uid_are_both_used(pair: list[Session]) -> None:
     other = replace(pair[1], metadata={**pair[1].metadata, "uid": pair[0].metadata["uid"]})
     (told,) = require_sound([pair[0], other], chain())
-    assert f"hold different samples and the uid {pair[0].metadata['uid']}" in told
-    assert "two recordings may stay" in told
+    assert f"hold different samples and the uid {pair[0].metadata['uid']}" in str(told)
+    assert "two recordings may stay" in str(told)
 
 
 def test_rows_of_a_sensor_dead_in_one_session_are_left_out(pair: list[Session]) -> None:

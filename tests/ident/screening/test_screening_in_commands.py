@@ -9,11 +9,12 @@ from typing import Any
 
 import pytest
 
-from benchmarks.wrong_channels import constant, scaled, swapped
+from benchmarks.wrong_channels import constant, from_the_middle, scaled, shifted, swapped
 from fri.errors import DataError
 from ident.estimation import Identification, IdentificationSettings, cross_validate, identify, validate
 from ident.estimation.identify import AUTO, Known
 from ident.rows.filters import SignalSettings
+from ident.screening.doubts import Doubt
 from ident.screening.screen import screen
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session
@@ -67,11 +68,21 @@ def test_a_chosen_estimator_screens_once_and_gives_no_advice_on_chosen_cut_offs(
 
 
 def test_what_is_known_of_sessions_is_not_asked_again(trio: list[Session], screened: list[int]) -> None:
-    known = Known(("something seen before",), ("a reason",))
+    known = Known((Doubt("log", (), "something seen before", "", "look"),), ("a reason",))
     again = identify(trio[:1], chain(), PLAIN, known=known)
     assert screened == []
     assert again.known == known
-    assert again.warnings == known.doubts
+    assert again.warnings == ("log: something seen before; look",)
+
+
+def test_a_wrong_torque_is_no_lack_of_motion(trio: list[Session]) -> None:
+    drifted = from_the_middle("joint", "effort", shifted("joint", "effort", 100.0, "A2"))(trio[:1])
+    found = identify(drifted, chain(), PLAIN)
+    (doubt,) = found.known.doubts
+    assert found.warnings == (str(doubt),)
+    assert found.assumptions["condition number"].holds
+    (weak,) = identify(drifted, chain(), PLAIN, known=Known()).warnings
+    assert weak.startswith("the motion hardly shows Fvl2 ")
 
 
 def test_worthless_sessions_are_not_validated(trio: list[Session], found: Identification) -> None:
