@@ -115,9 +115,9 @@ def _delay_of(summary: Mapping[str, Any], side: str) -> str:
     known = [
         (1e3 * one[f"{side}_delay_s"], 1e3 * (one.get(f"{side}_delay_std_s") or 0.0))
         for one in sessions or ()
-        if one.get(f"{side}_delay_s")
+        if one.get(f"{side}_delay_s") is not None
     ]
-    if not known:
+    if not any(delay for delay, _ in known):
         return ""
     delays, deviations = zip(*known, strict=True)
     sign, where = (-1.0, "before") if max(delays) < 0.0 else (1.0, "after")

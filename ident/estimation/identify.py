@@ -19,7 +19,7 @@ from ident.dynamics.tables import Tabular
 from ident.estimation.assumptions import Assumptions, check_assumptions, weak_parameters
 from ident.estimation.essential import Essential, EssentialSettings, find_essential
 from ident.estimation.plausibility import payload_warnings, require_plausible
-from ident.estimation.session_rows import session_rows, with_delays
+from ident.estimation.session_rows import apart_in_time, session_rows, with_delays
 from ident.estimators import ESTIMATORS
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.errors_in_variables import InstrumentalVariables
@@ -470,7 +470,7 @@ def observed(
     # One session after the other, so that memory holds the full-rate signals of one only.
     pairs = list(zip(chosen, mounted, strict=True))
     made = [make(session, payload, signals=settings.signals) for session, payload in pairs]
-    made = with_delays(made, pairs, settings.signals, make)
+    made = apart_in_time(with_delays(made, pairs, settings.signals, make))
     for warning in (text for one in made for text in one.prepared.warnings) if first else ():
         logger.warning("%s", warning)
     prepared, problems = [one.prepared for one in made], [one.problem for one in made]

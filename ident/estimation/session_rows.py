@@ -15,7 +15,7 @@ from ident.dynamics.base_set import BaseSet
 from ident.dynamics.structure import ModelStructure
 from ident.estimators.problem import Problem
 from ident.rows.content import Recall
-from ident.rows.delay import Delay, delays_from_model, fits_better
+from ident.rows.delay import Delay, delays_from_model, fits_better, shared_delay
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import prepare
@@ -152,6 +152,27 @@ def with_delays(
             found[k] = rows.doubted()
             logger.info("%s: %s torques %s", rows.prepared.name, rows.side, rows.delay)
     return found
+
+
+def apart_in_time(made: Sequence[SessionRows]) -> list[SessionRows]:
+    """The rows of all sessions, with a warning of those whose torques are late by another time than in the others."""
+    said: dict[int, list[str]] = {}
+    for name in dict.fromkeys(name for one in made for name in one.prepared.delays):
+        told = [k for k, one in enumerate(made) if name in one.prepared.delays]
+        usual, apart = shared_delay([made[k].prepared.delays[name] for k in told])
+        for k in (told[place] for place in apart):
+            delay = made[k].prepared.delays[name]
+            said.setdefault(k, []).append(
+                f"{made[k].prepared.name}: the {name.split('_')[0]} torques come {1e3 * delay.seconds:.1f} ± "
+                f"{1e3 * delay.std:.1g} ms after the positions, in the other session"
+                f"{'s' * (len(told) > 2)} {1e3 * usual:.1f} ms, which the model keeps; check how this one was recorded"
+            )
+    return [
+        replace(one, prepared=replace(one.prepared, warnings=(*one.prepared.warnings, *said[k])))
+        if k in said
+        else one
+        for k, one in enumerate(made)
+    ]
 
 
 def _told(made: Sequence[SessionRows], at: Sequence[Callable[[float], SessionRows]]) -> list[SessionRows]:

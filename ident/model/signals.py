@@ -17,6 +17,7 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 from ident.model.dynamic_model import DynamicModel
+from ident.rows.delay import shared_delay
 from ident.rows.filters import SignalSettings
 from ident.rows.prepared import PreparedSession
 
@@ -26,18 +27,14 @@ SIGNALS = "signals"
 def signals_entry(settings: SignalSettings, prepared: Sequence[PreparedSession] = ()) -> dict[str, Any]:
     """The entry of a model's provenance.
 
-    prepared : sessions of the estimate. Their cut-off and the delays of their torques (means with the weight of the
-    inverse variances) replace a choice or an estimate in the settings.
+    prepared : sessions of the estimate. Their cut-off and the delays of the torques of those that agree replace a
+    choice or an estimate in the settings.
     """
     entry = dataclasses.asdict(settings)
     if prepared:
         entry["cutoff_hz"] = float(np.median([one.cutoff_hz for one in prepared]))
     for name in dict.fromkeys(name for one in prepared for name in one.delays):
-        delays = [one.delays[name] for one in prepared if name in one.delays]
-        # Without a deviation it is stated, or not told by this session.
-        told = [delay for delay in delays if delay.std > 0.0]
-        weights = [delay.std**-2 for delay in told] or None
-        entry[name] = float(np.average([delay.seconds for delay in told or delays], weights=weights))
+        entry[name], _ = shared_delay([one.delays[name] for one in prepared if name in one.delays])
     return entry
 
 

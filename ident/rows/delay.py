@@ -73,6 +73,8 @@ _AGREES = 3.0
 _APART, _APART_S = 20.0, 5e-3
 # A delay within this many standard deviations of zero is not told apart from zero.
 _DISTINCT = 1.96
+# Delays of two sessions that differ, in standard deviations, and at least [s].
+_OTHER, _OTHER_S = 5.0, 3e-3
 # Latest estimates: an estimator prepares a session several times.
 _MOST_ESTIMATES = 64
 
@@ -156,6 +158,25 @@ class DelayData:
     motor_torque: Floats
     span: tuple[float, float]
     core: tuple[float, float] = (-np.inf, np.inf)
+
+
+def shared_delay(delays: Sequence[Delay]) -> tuple[float, tuple[int, ...]]:
+    """Delay [s] of the sessions that agree (mean with the weight of the inverse variances), and the numbers of others.
+
+    Sessions differ by how they were recorded, not by the arm. Of two the less late one has the usual delay. One without
+    a deviation is stated, or not told by its session.
+    """
+    told = [k for k, one in enumerate(delays) if one.std > 0.0] or list(range(len(delays)))
+    middle = sorted((delays[k] for k in told), key=lambda one: one.seconds)[(len(told) - 1) // 2]
+    apart = tuple(
+        k
+        for k in told
+        if abs(delays[k].seconds - middle.seconds)
+        > max(_OTHER_S, _OTHER * float(np.hypot(delays[k].std, middle.std)))
+    )
+    alike = [delays[k] for k in told if k not in apart]
+    weights = [one.std**-2 for one in alike if one.std > 0.0] or None
+    return float(np.average([one.seconds for one in alike], weights=weights)), apart
 
 
 def estimate_delay(

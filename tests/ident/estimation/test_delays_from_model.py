@@ -13,7 +13,7 @@ from fri.errors import DataError
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.validate import validate
 from ident.estimators.problem import Problem
-from ident.rows.delay import Delay, delays_from_model
+from ident.rows.delay import Delay, delays_from_model, shared_delay
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session, true_base
 
@@ -184,3 +184,29 @@ def test_torques_of_an_arm_at_rest_have_no_delay_to_tell() -> None:
     )
     with pytest.raises(DataError, match="changes with its delay"):
         delays_from_model(still, {0: "motor"}, {0: 0.0})
+
+
+def test_sessions_late_by_other_times_are_told_and_the_model_keeps_the_usual_delay() -> None:
+    logs = [alone(0.0, 1), alone(0.02, 2, 6, loaded=True)]
+    found = identify(logs, chain(), SETTINGS)
+    (told,) = [text for text in found.warnings if "in the other session " in text]
+    late = re.match(rf"{logs[1].path.name}: the motor torques come ([\d.]+) ± ", told)
+    assert late is not None
+    assert float(late[1]) == pytest.approx(20.0, abs=0.5)
+    assert found.model.provenance["signals"]["motor_delay_s"] == pytest.approx(0.0, abs=1e-3)
+    alike = identify([alone(0.02, 1), alone(0.02, 2, 6, loaded=True)], chain(), SETTINGS)
+    assert not [text for text in alike.warnings if "in the other session" in text]
+
+
+def test_the_delay_that_sessions_share() -> None:
+    def delays(*known: tuple[float, float]) -> list[Delay]:
+        return [Delay(1e-3 * seconds, 1e-3 * std, "") for seconds, std in known]
+
+    assert shared_delay(delays((2.0, 0.1), (2.2, 0.1))) == (pytest.approx(2.1e-3), ())
+    assert shared_delay(delays((20.0, 0.1), (0.5, 0.1))) == (pytest.approx(0.5e-3), (0,))
+    assert shared_delay(delays((5.0, 0.1), (5.0, 0.1), (0.0, 0.1))) == (pytest.approx(5e-3), (2,))
+    # Within three milliseconds, or within what is known of them.
+    assert shared_delay(delays((0.0, 0.1), (2.9, 0.1)))[1] == ()
+    assert shared_delay(delays((0.0, 3.0), (12.0, 0.1)))[1] == ()
+    # Of a session without a deviation nothing is known.
+    assert shared_delay(delays((0.0, 0.0), (12.0, 0.1))) == (pytest.approx(12e-3), ())
