@@ -66,7 +66,7 @@ _TOLERANCE = 0.005
 # Bins left out beside a reversal; the last ones are far from it.
 _WINDOWS = (0, 1, 2, 3, 4, 5, 7, 10)
 # Paths left out after a reversal [rad].
-_PATHS = (2e-3, 5e-3, 1e-2)
+_PATHS = (2e-3, 5e-3, 1e-2, 2e-2, 5e-2)
 # Speeds up to which slow motion is left out [rad/s].
 _SPEEDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 _WIDTHS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
