@@ -261,15 +261,15 @@ def filtered_motions(
             yield Motion.of(part, span, core, wide(part, low, high), settings)
 
 
-def excitation_hz(motions: Sequence[Motion], part: Stretch, dt: float) -> float:
-    """Upper frequency of the motion of a stretch [Hz]."""
+def excitation_hz(motions: Sequence[Motion], part: Stretch, dt: float, cutoff_hz: float) -> float:
+    """Upper frequency of the motion of a stretch [Hz], its velocities low-passed at `cutoff_hz`."""
     spectrum = Excitation(part.count, dt)
     for motion in motions:
         if motion.start == part.start:
             mine = (motion.times >= motion.core[0]) & (motion.times < motion.core[1])
             spectrum.add(motion.qd[mine])
             release(*motion.arrays)
-    return spectrum.frequency()
+    return spectrum.frequency(cutoff_hz=cutoff_hz)
 
 
 def _cut(

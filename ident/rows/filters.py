@@ -405,6 +405,11 @@ def _kaiser(position: Floats, attenuation_db: float) -> Floats:
     return np.i0(beta * np.sqrt(np.maximum(1.0 - position**2, 0.0))) / np.i0(beta)
 
 
+# Power of a motion over that of noise, of which a tenth of the frequencies are louder: a repeated motion repeats the
+# steps of its encoder, whose spectrum has lines. Frequencies that tell it: some of a recording of eight seconds.
+_NOISE, _LOUD, _LINES = 5.0, 0.9, 30
+
+
 class Excitation:
     """Upper frequency of a motion from its blocks: Welch's spectrum, segment after segment."""
 
@@ -429,17 +434,25 @@ class Excitation:
             self._power = self._power + whole * power
         self._rest = np.array(rest[whole * step :])
 
-    def frequency(self, share: float = 0.999) -> float:
+    def frequency(self, share: float = 0.999, cutoff_hz: float = np.inf) -> float:
         """Upper frequency [Hz] of `share` of the power of the fastest-changing joint velocity.
 
-        About the highest harmonic n_f w0 of a Fourier excitation.
+        About the highest harmonic n_f w0 of a Fourier excitation. cutoff_hz : of the low-pass on the velocities. Noise
+        of the positions, such as the steps of a coarse encoder, has a power that grows with the square of the
+        frequency; what does not rise above it is left out.
         """
         count = sum(n for n, _, _ in self._moments)
         mean = sum(n * m for n, m, _ in self._moments) / count
         variance = sum(square + n * (m - mean) ** 2 for n, m, square in self._moments) / count
         highest = 0.0
         for joint in np.flatnonzero(variance > 1e-4 * np.max(variance, initial=0.0)):
-            cumulative = np.cumsum(np.asarray(self._power)[:, joint])
+            power = np.asarray(self._power)[:, joint]
+            noise = self._frequency >= 0.4 * cutoff_hz
+            noise &= self._frequency <= 0.8 * cutoff_hz
+            if np.count_nonzero(noise) >= _LINES:
+                level = _NOISE * float(np.quantile(power[noise] / self._frequency[noise] ** 2, _LOUD))
+                power = np.where(power > level * self._frequency**2, power, 0.0)
+            cumulative = np.cumsum(power)
             if cumulative[-1] > 0:
                 place = np.searchsorted(cumulative, share * cumulative[-1])
                 highest = max(highest, float(self._frequency[place]))

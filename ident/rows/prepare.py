@@ -126,7 +126,7 @@ def prepare(
     motions = motions_shelved(filtered_motions(parts, wide, settings, blocks))
     release(position, effort)
     longest = max(parts, key=lambda part: part.count)
-    excitation = recall.of(partial(excitation_hz, motions, longest, dt), *same)
+    excitation = recall.of(partial(excitation_hz, motions, longest, dt, settings.cutoff), *same)
     flagged = {
         "stale": int(seen.stale.sum()),
         "position_outliers": int(position_flags.sum()),

@@ -188,6 +188,26 @@ def test_the_excitation_takes_half_overlapping_segments_of_thirty_seconds() -> N
     assert found.frequency() > 8.8
 
 
+def test_the_steps_of_a_coarse_encoder_are_no_excitation() -> None:
+    time = np.arange(30_000) * 0.002
+    position = sum(0.15 / k * np.sin(2 * np.pi * k * time + k**2) for k in (0.127, 0.211, 0.377, 0.6))
+    steps = np.round(np.asarray(position) / 0.01) * 0.01
+    for cutoff_hz in (20.0, 60.0):
+        speed = low_pass(np.gradient(steps, 0.002)[:, None], 0.002, cutoff_hz)
+        found = Excitation(len(speed), 0.002)
+        found.add(speed)
+        assert found.frequency() > 0.3 * cutoff_hz
+        assert found.frequency(cutoff_hz=cutoff_hz) == pytest.approx(0.6, abs=0.15)
+
+
+def test_fast_motion_is_no_noise() -> None:
+    time = np.arange(30_000) * 0.002
+    speed = sum(np.sin(2 * np.pi * f * time + f) for f in (0.5, 1.0, 2.0, 4.0, 7.0))
+    found = Excitation(len(time), 0.002)
+    found.add(np.asarray(speed)[:, None])
+    assert found.frequency(cutoff_hz=10.0) == pytest.approx(7.0, abs=0.2)
+
+
 def test_a_joint_of_a_hundredth_of_the_speed_is_the_slowest_that_counts() -> None:
     time = np.arange(6000) * 0.01
     slow, fast = np.sin(2 * np.pi * 0.5 * time), np.sin(2 * np.pi * 4.0 * time)
