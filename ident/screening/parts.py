@@ -23,6 +23,8 @@ LEFT = 0.75
 # Share of a class's squared residual that an error of one part explains, and size of a zero or a drift over the rms of
 # the torque, or over the largest of the side.
 _EXPLAINED, _ZERO, _OF_LARGEST = 0.25, 0.18, 0.02
+# Share of these sizes that is enough where half of the residual goes with it: nothing else looks so.
+_SMALL, _PLAIN = 0.45, 0.5
 _NOTHING = 1e-9
 
 ErrorKind = Literal["gain", "zero", "drift"]
@@ -47,7 +49,7 @@ class PartError:
 
 def part_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PartError]:
     """Gains and zeros of single sessions, and of halves of them, beyond what a calibration and chance explain."""
-    asked = list(_suspects(data, fit, normal))
+    asked = _suspects(data, fit, normal)
     if not asked:
         return []
     shared = data.shared(fit)
@@ -67,7 +69,7 @@ def part_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PartError]:
         PartError(key, parts, kind, size.value + (kind == "gain"), size.std, size.left)
         for (key, parts, kind), size in zip(asked, sizes, strict=True)
         if abs(size.value) > DEVIATIONS * size.std
-        and size.left < LEFT
+        and size.left < (LEFT if abs(size.value) > asked[key, parts, kind] else _PLAIN)
         # A torque that is nothing there is no gain: `channels` finds it.
         and (kind != "gain" or abs(size.value + 1.0) > _NOTHING)
     ]
@@ -75,8 +77,9 @@ def part_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PartError]:
 
 def _suspects(
     data: Redundancy, fit: Fit, normal: Normal
-) -> Iterator[tuple[Class, tuple[Part, ...], ErrorKind]]:
-    """Errors of a part that explain much of the residual of their class."""
+) -> dict[tuple[Class, tuple[Part, ...], ErrorKind], float]:
+    """Errors of a part that explain much of the residual of their class, and the size of interest."""
+    found = {}
     place = {part: k for k, part in enumerate(normal.parts)}
     classes = {key: k for k, key in enumerate(normal.classes)}
     bodies = data.shared(fit)
@@ -117,8 +120,9 @@ def _suspects(
                 if left <= 1e-9 * weight * power[k, at, number].sum():
                     continue
                 size = weight * product[k, at, number].sum() / left
-                if abs(size) > least[kind] and size**2 * left > _EXPLAINED:
-                    yield key, parts, kind
+                if abs(size) > _SMALL * least[kind] and size**2 * left > _EXPLAINED:
+                    found[key, parts, kind] = least[kind]
+    return found
 
 
 def _added(rows: SampledRows, computed: Floats) -> Floats:

@@ -322,7 +322,12 @@ def _of_part(one: Explanation, sessions: Sequence[Session]) -> tuple[str, str, b
         return session, f"{way} by {abs(value):.3g} ± {std:.2g} Nm from start to end against {rest}", False
     if one.error.kind == "zero":
         more = "higher" if value > 0.0 else "lower"
-        return session, f"is {abs(value):.3g} ± {std:.2g} Nm {more} than {rest}", False
+        either = ", or the other session's" if len(sessions) == 2 and len(one.parts) == 2 else ""
+        return (
+            session,
+            f"is {abs(value):.3g} ± {std:.2g} Nm {more} than {rest} (its zero is wrong{either})",
+            False,
+        )
     gross = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
     return session, f"is {value:.4g} ± {std:.2g} times {rest}", gross and one.error.left < _LEFT
 

@@ -99,6 +99,7 @@ M, L = ("motor", "effort"), ("joint", "effort")
         (from_the_middle(*M, scaled(*M, -1.0, "A4")), "motor", ("A4",), "second half", True, 0),
         (from_the_middle(*L, scaled(*L, 0.7, "A2")), "joint", ("A2",), "second half", False, 0),
         (in_one(drifting(*L, -15.0, "A2"), 1), "joint", ("A2",), "falls by 13", False, 1),
+        (in_one(scaled(*L, 0.87, "A2"), 1), "joint", ("A2",), "a gain of 0.8", False, 1),
     ],
 )
 def test_a_torque_wrong_in_a_part_of_the_data_is_named_with_it(  # type: ignore[no-untyped-def]
