@@ -1,7 +1,9 @@
 """The lasting effects that healthy sets of sessions have in common: this arm's own, and no fault.
 
 One set seldom shows a small effect clearly. So its evidence is the sum over all sets, and its size has to be the same
-in each but for their own uncertainty: an effect of another size every day is no property of the arm.
+in each but for their own uncertainty: an effect of another size every day is no property of the arm. A cause is there
+once in a joint, with the best shape beside the others. Columns of the speed are hardly independent, so a law of it is a
+part of the drive's friction: no fit may hold a law larger than the whole against the other columns.
 """
 
 from __future__ import annotations
@@ -74,6 +76,12 @@ class Size:
         return bool(np.linalg.norm(self.mean) > _CLEAR * self.from_set_to_set)
 
     @property
+    def certainty(self) -> float:
+        """The mean over its own standard deviation and that from set to set."""
+        own = np.trace(self.covariance) + self.from_set_to_set**2
+        return float(np.linalg.norm(self.mean) / np.sqrt(max(own, 1e-300)))
+
+    @property
     def p_value(self) -> float:
         """Probability of such a mean where all are zero."""
         return chance(self.mean, self.covariance, self.blocks)
@@ -89,6 +97,12 @@ class _Set:
 
     def __post_init__(self) -> None:
         self.state = State(self.bench.dictionary, self.bench.evidence, self.settings)
+
+    def take(self, candidate: Candidate, shape: Shape) -> Trial:
+        """An effect of a given shape, whatever its size in this set."""
+        dictionary = self.bench.dictionary
+        rows = dictionary.rows(candidate, shape)
+        return Trial(candidate, shape, dictionary.measure(candidate, rows), rows)
 
     def found(self) -> dict[tuple[str, int], Trial]:
         """The best shape of each candidate beside what was accepted."""
@@ -114,9 +128,31 @@ class _Set:
         if bench is None:
             return self
         again = _Set(bench, self.settings)
-        remade = (again.trial(trial.candidate, trial.shape) for trial in self.accepted)
-        again.accepted = [trial for trial in remade if trial is not None]
+        again.accepted = [again.take(trial.candidate, trial.shape) for trial in self.accepted]
         return again
+
+    def parts(self, trials: Sequence[Trial]) -> list[bool]:
+        """Whether each of some effects, fitted together, is part of its drive's friction where it is largest; True for
+        those that are no law of the speed."""
+        nominal, evidence = self.bench.nominal, self.bench.evidence
+        present = list(evidence.extra)
+        evidence.replace([*(trial.rows for trial in trials), *self.state.nuisance_rows])
+        base, torques = evidence.full.values[: evidence.base_count], dict[int, Floats]()
+        for k, (trial, size) in enumerate(zip(trials, evidence.coefficients(), strict=False)):
+            law, key = trial.candidate.effect.law, ("motor", trial.candidate.joint)
+            if law is not None and law.variable == "qd" and key in trial.rows:
+                torques[k] = trial.rows[key] @ size
+        evidence.replace(present)
+        found = [True] * len(trials)
+        for k, torque in torques.items():
+            joint = trials[k].candidate.joint
+            rows, names = nominal.rows["motor"], (f"Fcm{joint + 1}", f"Fvm{joint + 1}")
+            drive = [place for place, name in enumerate(nominal.base.names) if name in names]
+            at = int(np.argmax(np.abs(torque) * rows.valid[:, joint]))
+            laws = sum(float(other[at]) for i, other in torques.items() if trials[i].candidate.joint == joint)
+            whole = abs(float(rows.matrix[joint][at, drive] @ base[drive]) + laws)
+            found[k] = abs(float(torque[at])) <= trials[k].candidate.effect.largest_share * whole
+        return found
 
 
 def character(
@@ -137,6 +173,7 @@ def character(
     for search in range(_SEARCHES):
         if search and chosen:
             sets = [one.quieter(causes) for one in sets]
+            chosen = _reshaped(sets, chosen, settings)
         for _ in range(settings.rounds):
             more = _in_common(sets, settings)
             for trials in more:
@@ -144,7 +181,7 @@ def character(
                 log.info("in common: %s", candidate.key)
                 chosen.append((candidate, shape))
                 for one, trial in zip(sets, trials, strict=True):
-                    one.accepted += [] if trial is None else [trial]
+                    one.accepted.append(one.take(candidate, shape) if trial is None else trial)
             if not more:
                 break
     own = [c for c in chosen if c[0].effect not in (ELASTICITY, PRESLIDING)]
@@ -178,9 +215,15 @@ def _in_common(sets: Sequence[_Set], settings: DiagnosisSettings) -> list[list[T
 
 
 def _alike(
-    sets: Sequence[_Set], trials: Sequence[Trial | None], settings: DiagnosisSettings
+    sets: Sequence[_Set],
+    trials: Sequence[Trial | None],
+    settings: DiagnosisSettings,
+    without: int | None = None,
 ) -> list[Trial | None] | None:
-    """An effect with one shape in all sets, None without enough evidence; None for a set that contradicts it."""
+    """An effect with one shape in all sets, None without enough evidence; None for a set that contradicts it.
+
+    without : number of the accepted one that it replaces.
+    """
     known = [(one, trial) for one, trial in zip(sets, trials, strict=True) if trial is not None]
     known = sorted(known, key=lambda pair: -pair[1].score.gain)[:_SHAPES]
     refined = (one.bench.dictionary.refine(trial).shape for one, trial in known)
@@ -190,9 +233,41 @@ def _alike(
             trial if trial is not None and trial.shape == shape else one.trial(known[0][1].candidate, shape)
             for one, trial in zip(sets, trials, strict=True)
         ]
-        if best is None or _gain(tried) > _gain(best):
+        if best is not None and _gain(tried) <= _gain(best):
+            continue
+        beside = [[t for k, t in enumerate(one.accepted) if k != without] for one in sets]
+        parts = [
+            one.parts([*rest, trial])[-1]
+            for one, rest, trial in zip(sets, beside, tried, strict=True)
+            if trial is not None
+        ]
+        if 2 * sum(parts) > len(parts):
             best = tried
     return best if best is not None and _carried(best, settings) else None
+
+
+def _reshaped(
+    sets: Sequence[_Set], chosen: Sequence[tuple[Candidate, Shape]], settings: DiagnosisSettings
+) -> list[tuple[Candidate, Shape]]:
+    """The effects in common, each with its best shape beside the others, without those that need no place there."""
+    kept = list(chosen)
+    for candidate, shape in chosen:
+        if not candidate.effect.continuous(shape):
+            continue
+        place = kept.index((candidate, shape))
+        for one in sets:
+            one.state.tolerate([t for k, t in enumerate(one.accepted) if k != place])
+        trials = _alike(sets, [one.trial(candidate, shape) for one in sets], settings, without=place)
+        kept.pop(place)
+        for one in sets:
+            one.accepted.pop(place)
+        if trials is None:
+            continue
+        shape = next(t.shape for t in trials if t is not None)
+        kept.insert(place, (candidate, shape))
+        for one, trial in zip(sets, trials, strict=True):
+            one.accepted.insert(place, one.take(candidate, shape) if trial is None else trial)
+    return kept
 
 
 def _gain(trials: Sequence[Trial | None]) -> float:
@@ -221,26 +296,44 @@ def _carried(trials: Sequence[Trial | None], settings: DiagnosisSettings) -> boo
 
 
 def _entries(sets: Sequence[_Set], chosen: Sequence[tuple[Candidate, Shape]]) -> list[dict[str, Any]]:
-    """Entries of effects with their sizes fitted together in each set, without those that do not last."""
-    values: list[list[Floats]] = [[] for _ in chosen]
-    own: list[list[Floats]] = [[] for _ in chosen]
-    for one in sets:
-        dictionary, evidence = one.bench.dictionary, one.bench.evidence
-        rows = [dictionary.rows(*each) for each in chosen]
-        evidence.replace([*rows, *one.state.nuisance_rows])
-        covariance, place = evidence.covariance(), evidence.base_count
-        for k, value in enumerate(evidence.coefficients()[: len(chosen)]):
-            here = slice(place, place + len(value))
-            values[k].append(value)
-            own[k].append(covariance[here, here])
-            place = here.stop
+    """Entries of effects with their sizes fitted together in each set, without those that do not last or that no drive
+    has in that size."""
+    chosen = list(chosen)
+    while chosen:
+        fits = [_fitted(one, chosen) for one in sets]
+        sizes = [
+            Size.of([fit[k][0] for fit in fits], [fit[k][1] for fit in fits], candidate.effect.usual_change)
+            for k, (candidate, _) in enumerate(chosen)
+        ]
+        agreed = [2 * sum(fit[k][2] for fit in fits) > len(fits) for k in range(len(chosen))]
+        unsound = [
+            k
+            for k, ((candidate, shape), size) in enumerate(zip(chosen, sizes, strict=True))
+            if not (size.lasting and agreed[k] and candidate.effect.plausible(size.mean, shape))
+        ]
+        if not unsound:
+            break
+        # Without the least certain one the others may be sound.
+        chosen.pop(min(unsound, key=lambda k: sizes[k].certainty))
     found = []
-    for (candidate, shape), each, covariances in zip(chosen, values, own, strict=True):
-        size = Size.of(each, covariances, candidate.effect.usual_change)
-        if size.lasting:
-            std = np.std(each, axis=0, ddof=1) if len(each) > 1 else np.zeros(len(size.mean))
-            found.append(_entry(candidate, shape, size.mean, std))
-            log.info("character: %s", candidate.key)
+    for k, (candidate, shape) in enumerate(chosen):
+        each = [fit[k][0] for fit in fits]
+        std = np.std(each, axis=0, ddof=1) if len(each) > 1 else np.zeros(len(sizes[k].mean))
+        found.append(_entry(candidate, shape, sizes[k].mean, std))
+        log.info("character: %s", candidate.key)
+    return found
+
+
+def _fitted(one: _Set, chosen: Sequence[tuple[Candidate, Shape]]) -> list[tuple[Floats, Floats, bool]]:
+    """Coefficients (k,) of effects fitted together, their covariance (k, k), and whether they are part of the
+    friction, see `_Set.parts`."""
+    evidence, trials = one.bench.evidence, [one.take(*each) for each in chosen]
+    evidence.replace([*(trial.rows for trial in trials), *one.state.nuisance_rows])
+    covariance, place, found = evidence.covariance(), evidence.base_count, []
+    for value, part in zip(evidence.coefficients(), one.parts(trials), strict=False):
+        here = slice(place, place + len(value))
+        found.append((value, covariance[here, here], part))
+        place = here.stop
     return found
 
 

@@ -118,6 +118,8 @@ class Stribeck(Effect):
     cause = "stribeck"
     side = "motor"
     usual_share = _FRICTION
+    # At standstill at most twice the Coulomb level.
+    largest_share = 0.5
     character = True
     summary = "friction rises as the velocity falls towards zero"
     physics = "the lubricant film breaks down at low speed, so friction rises as the speed falls towards zero"

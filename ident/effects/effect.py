@@ -270,7 +270,7 @@ class Effect(ABC):
     character : every drive of the kind has it, so it is no fault by itself.
     evidence_factor : multiple of the usual evidence, for a cause the nominal arm itself resembles slightly.
     usual_change : standard deviation of its size from day to day on any arm of the kind. usual_share : the same where
-    a healthy arm has it, as a share of its size.
+    a healthy arm has it, as a share of its size. largest_share : of the drive's friction, for a law of the speed.
     beside_companions : the law is coarse, so parameters are estimated beside the companions.
     confused_with : causes alike in many motions, for docs/effects.md only; the diagnosis finds look-alikes in the
     data. contains : special cases of it.
@@ -302,6 +302,7 @@ class Effect(ABC):
     evidence_factor: ClassVar[float] = 1.0
     usual_change: ClassVar[float] = 0.0
     usual_share: ClassVar[float] = 0.05
+    largest_share: ClassVar[float] = 1.0
     beside_companions: ClassVar[bool] = False
     confused_with: ClassVar[tuple[str, ...]] = ()
     contains: ClassVar[tuple[str, ...]] = ()
