@@ -186,7 +186,7 @@ class _Day:
     """Results of one set: base parameters (p,) and covariance (p, p), noise of a row by side and the rows that count as
     one for it, Coulomb friction of the drives (n,) [Nm] and its slow part, see `slow_turns`; delays of the channels
     beyond the arm's, with standard deviation, by side [s]. torque_rms : of the rows by side, (n,) [Nm]. masses :
-    announced, of its payloads [kg].
+    announced, of its payloads [kg]. whole : the parameters (p,) with the friction of each drive as a whole.
     gains : (2, n) errors of the torque sensors' gains with standard deviations, NaN where unknown.
     """
 
@@ -201,6 +201,7 @@ class _Day:
     slow_turns: SlowTurns
     late: Mapping[str, tuple[float, float]]
     gains: Floats
+    whole: Floats
 
 
 def commission(
@@ -447,10 +448,11 @@ def _day(
     # `select` adds the tolerated deviations to the base.
     selection = select(bench.dictionary, evidence, settings, None)
     nuisance, p = selection.nuisance, evidence.base_count
+    values = evidence.full.values[:p].copy()
     return _Day(
         bench.nominal.base,
         bench.nominal.masses,
-        evidence.full.values[:p].copy(),
+        values,
         evidence.covariance()[:p, :p],
         evidence.sigma,
         evidence.variance_inflation,
@@ -459,6 +461,7 @@ def _day(
         slow_turns(bench.nominal, bench.evidence),
         {side: mean_delay(nuisance, side) for side in _CHANNELS},
         _gains(bench, selection.nuisance_rows),
+        bench.nominal.whole_friction(values),
     )
 
 
@@ -492,7 +495,15 @@ def _reference(
     rms = {side: np.mean([day.torque_rms[side] for day in days], axis=0) for side in usual.torque_rms}
     changing = [_known(day, usual) for day in habits] or known
     efforts = base.structure.chain.efforts()
-    variance = habit(base.names, [values for values, _ in changing], [c for _, c in changing], rms, efforts)
+    of_friction = [_known(replace(day, values=day.whole), usual)[0] for day in habits or days]
+    variance = habit(
+        base.names,
+        [values for values, _ in changing],
+        [c for _, c in changing],
+        rms,
+        efforts,
+        np.nanmean(of_friction, axis=0),
+    )
     precision, pull = np.zeros((len(base), len(base))), np.zeros(len(base))
     for values, covariance in known:
         # A mean weighted by each day's own uncertainty alone would turn their changes into errors of all parameters.

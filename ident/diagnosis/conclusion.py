@@ -22,7 +22,7 @@ from ident.diagnosis.reference import Reference
 from ident.diagnosis.refit import left_by, refitted
 from ident.diagnosis.result import Diagnosis, Finding, RowStates, Unexplained
 from ident.diagnosis.task import Baseline, State, Task
-from ident.diagnosis.tolerances import GAIN
+from ident.diagnosis.tolerances import GAIN, HABIT, SIZE
 from ident.diagnosis.wear import is_level, wear
 from ident.effects import EFFECTS
 from ident.rows.data_quality import sample_loss
@@ -48,8 +48,10 @@ def conclude(task: Task, state: State) -> Diagnosis:
     worn = []
     if task.reference is not None:
         shown = held_out(evidence, [*(one.claim.trial.rows for one in kept), *nuisance])
-        # Without the reference's prior, gains of the sensors and drive inertias compensate each other.
-        tolerated = [rows for name, rows in state.selection.tolerated.items() if not name.startswith(GAIN)]
+        # Without the reference's prior, gains of the sensors and drive inertias compensate each other, and so do
+        # Coulomb and viscous friction and further laws, of fixed size or none in the reference's parameters.
+        free = (GAIN, SIZE, HABIT)
+        tolerated = [rows for name, rows in state.selection.tolerated.items() if not name.startswith(free)]
         claimed = [one.claim.trial.rows for one in kept]
         worn = wear(bench, task.reference, shown, claimed, tolerated, remainders)
     members = [

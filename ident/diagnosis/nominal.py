@@ -494,10 +494,10 @@ class Nominal:
         self.rows = {side: self._side_rows(side) for side in self.sides}
         for side in self.sides if self.arm.healthy else ():
             of: Side = "motor" if side == "motor" else "joint"
-            rows, torque = self.rows[side], self._healthy_torque(of)
+            rows, torque = self.rows[side], self.healthy_torque(of)
             self.rows[side] = replace(rows, target=rows.target - torque)
 
-    def _healthy_torque(self, side: Side) -> Floats:
+    def healthy_torque(self, side: Side) -> Floats:
         """Torque (m, n) [Nm] of the healthy arm's own effects."""
 
         def made(motion: ArmMotion) -> tuple[Column, ...]:
@@ -505,6 +505,23 @@ class Nominal:
             return (Column(motor=torque) if side == "motor" else Column(joint=torque),)
 
         return self.columns(made, [side])[side][0]
+
+    def whole_friction(self, values: Floats) -> Floats:
+        """Base parameters (p,) with the friction of each drive as a whole: the Coulomb and viscous friction nearest, in
+        its rows, to that of the parameters with the healthy arm's own effects, for columns of the speed are hardly
+        independent."""
+        found = values.copy()
+        if "motor" not in self.rows or not self.arm.healthy:
+            return found
+        rows, torque = self.rows["motor"], self.healthy_torque("motor")
+        for joint in np.flatnonzero(self.moving).tolist():
+            keep = rows.valid[:, joint]
+            names = [f"{symbol}{joint + 1}" for symbol in ("Fcm", "Fvm", "offm")]
+            places = [k for k, name in enumerate(self.base.names) if name in names]
+            more = np.linalg.lstsq(rows.matrix[joint][keep][:, places], torque[keep, joint], rcond=None)[0]
+            for k, value in zip(places, more, strict=True):
+                found[k] += 0.0 if self.base.names[k].startswith("offm") else value
+        return found
 
     def _side_rows(self, side: str) -> SideRows:
         parts: list[tuple[Any, ...]] = []

@@ -316,12 +316,14 @@ def habit(
     covariances: Sequence[Floats],
     torque_rms: Mapping[str, Floats],
     efforts: Floats | None = None,
+    sizes: Floats | None = None,
 ) -> Floats:
     """Variance (p,) of healthy parameters from day to day around their mean.
 
     days, covariances : parameters (p,) and covariance (p, p) of each day, NaN for the parameters of another payload.
     torque_rms : of the rows by side, (n,) [Nm]. efforts : (n,) largest torques [Nm]; a sensor's zero may go with its
-        range and not with the torque of a motion.
+        range and not with the torque of a motion. sizes : (p,) of which the changes are shares, default the mean: the
+        friction of a law of several columns changes as a whole.
     Joints of an arm have the same habits, so all parameters of a symbol share one relative variance: the scatter of the
     days beyond their own uncertainty, and the usual change as some further changes. Two days of a 7-joint arm are
     seven changes of its Coulomb friction. What the model lacks bends the parameters differently with each motion, those
@@ -331,13 +333,14 @@ def habit(
     values = np.array(days)
     count = np.isfinite(values).sum(axis=0)
     mean, own = np.nanmean(values, axis=0), np.nanmean([np.diag(c) for c in covariances], axis=0)
+    of = mean if sizes is None else sizes
     symbols = [symbol_of(name) for name in names]
     # With motor torques alone their rows show the offsets of the links' friction.
     sides = {"offm": "motor", "offl": "joint" if "joint" in torque_rms else "motor"}
     scale = np.array(
         [
             float(torque_rms[sides[symbol]][joint_of(name)]) if symbol in _OFFSETS else abs(value)
-            for name, symbol, value in zip(names, symbols, mean, strict=True)
+            for name, symbol, value in zip(names, symbols, of, strict=True)
         ]
     )
     usual = np.array([_USUAL.get(symbol, _ELSE) for symbol in symbols])

@@ -18,7 +18,7 @@ from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Floats, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.diagnosis.tolerances import HABITUAL, LENGTH, Tolerance, tolerances, usual_change
+from ident.diagnosis.tolerances import HABIT, HABITUAL, LENGTH, Tolerance, tolerances, usual_change
 from ident.diagnosis.usual_sizes import Healthy
 from ident.effects import Shape
 from ident.estimators.estimate import normal_tail
@@ -38,7 +38,6 @@ _LAW_ERROR, _MOSTLY = 0.1, 0.8
 # Least time between two separate pushes [s].
 _PAUSE_S = 0.2
 # Habits of the arm that are tolerated: least gain, least share of the best candidate's gain, and number.
-_HABIT = "habit"
 _LEAST_HABIT, _NEAR, _MOST_HABITS = 100.0, 0.5, 4
 # Least gain of `best_candidate`.
 _LEAST_GAIN = 10.0
@@ -287,13 +286,13 @@ class State:
     def habit(self, found: Sequence[Trial]) -> bool:
         """Tolerates the best candidate of a gain as on healthy days, near that of the best one of all; whether there is
         one. A change from day to day that is not in the model would pass for other causes."""
-        known = [one for one in self.tolerated() if one.name.startswith(_HABIT)]
+        known = [one for one in self.tolerated() if one.name.startswith(HABIT)]
         near = [t for t in found if t.score.gain > max(_LEAST_HABIT, _NEAR * found[0].score.gain)]
         for trial in near if len(known) < _MOST_HABITS else ():
             single = len(trial.score.coefficients) == 1 and not trial.candidate.effect.event
             if single and not self.carried(trial) and self.carried(trial, healthy=False):
                 log.info("%s: gain %.0f, as on healthy days", trial.candidate.key, trial.score.gain)
-                name = f"{_HABIT} {len(known) + 1}: {trial.candidate.cause} {trial.candidate.joint + 1}"
+                name = f"{HABIT} {len(known) + 1}: {trial.candidate.cause} {trial.candidate.joint + 1}"
                 self.tolerated().append(Tolerance(name, trial.rows, 1.0, np.inf, trial.candidate.key))
                 return True
         return False
@@ -319,6 +318,23 @@ class State:
         limit = max(self._limit(candidate, limit, size.shape), self._least(candidate, here))
         changed = change > 0.0 and change + other > limit
         return changed or (more and not size.clear(here, self._limit(candidate, size.scatter, size.shape)))
+
+    def _by_habits(self, trial: Trial) -> bool:
+        """Whether a trial is more than on a healthy arm only beside habits in its rows: the healthy sets were without
+        them, and columns of friction share it among them."""
+        habits = [
+            id(rows)
+            for name, rows in zip(self.nuisance, self.nuisance_rows, strict=True)
+            if name.startswith(HABIT) and set(rows) & set(trial.rows)
+        ]
+        if not habits:
+            return False
+        present = list(self.evidence.extra)
+        self.evidence.replace([rows for rows in present if id(rows) not in habits])
+        alone = self.dictionary.trial(trial.candidate, trial.shape, self.choices(trial))
+        found = alone is None or not self.unusual(alone)
+        self.evidence.replace(present)
+        return found
 
     def _least(self, candidate: Candidate, score: Score) -> float:
         """Least gain of a claim."""
@@ -376,7 +392,7 @@ class State:
         least = self._least(trial.candidate, score)
         if score.gain <= least:
             return False
-        if healthy and not self.unusual(trial):
+        if healthy and (not self.unusual(trial) or self._by_habits(trial)):
             return False
         if trial.candidate.effect.seen_in_samples(trial.shape):
             return True

@@ -52,6 +52,8 @@ LENGTH = "presliding"
 """The same for the presliding length of a drive, the logarithm of the factor on it."""
 TURNING = "turning"
 """The same for friction that turns over the usual length where that of the drive is unknown, a share of it."""
+HABIT = "habit"
+"""The same for a habit of the arm, before its number, its cause and its joint."""
 SIZE = "size"
 """The same for one of the healthy arm's own effects, a share of it, before its number among them."""
 

@@ -74,6 +74,8 @@ def wear(
         evidence.replace([*beside, *tolerated, *gains])
         return evidence.free(gains, reference.gain_std)
 
+    # The shares are those of the friction as a whole.
+    whole = nominal.whole_friction(healthy)
     values, covariance = alone(claimed)
     # Motor torques sampled at another phase of the commands show another inertia.
     other = ("Ia",) if nominal.arm.motor_delay_s != reference.motor_delay_s else ()
@@ -83,7 +85,7 @@ def wear(
         names = {
             f"{symbol}{joint + 1}": label for symbol, label in _PARAMETERS.items() if symbol not in other
         }
-        places = [k for k in known.tolist() if nominal.base.names[k] in names and healthy[k] > 0.0]
+        places = [k for k in known.tolist() if nominal.base.names[k] in names and whole[k] > 0.0]
         if not places:
             continue
         change = values[places] - healthy[places]
@@ -95,11 +97,11 @@ def wear(
         if nominal.slow_motor_samples:
             # The phase of slow samples differs from day to day, evenly.
             drive = np.array([nominal.base.names[k].startswith("Ia") for k in places])
-            own = own + np.diag(np.where(drive, INERTIA_BY_PHASE * healthy[places], 0.0) ** 2 / 3.0)
+            own = own + np.diag(np.where(drive, INERTIA_BY_PHASE * whole[places], 0.0) ** 2 / 3.0)
         square = float(change @ np.linalg.solve(own, change))
         freedom = max(float(reference.sets * len(moving)), 2.0)
         p_value = min(1.0, len(moving) * fisher_tail(square / len(places), len(places), freedom))
-        share, std = change / healthy[places], np.sqrt(np.diag(own)) / healthy[places]
+        share, std = change / whole[places], np.sqrt(np.diag(own)) / whole[places]
         if p_value > _ONE_IN or np.max(np.abs(share)) < _MATTERS:
             continue
         labels = [names[nominal.base.names[k]] for k in places]
