@@ -199,6 +199,7 @@ class State:
     nuisance: dict[str, tuple[float, float]] = field(default_factory=dict)
     nuisance_rows: list[Rows] = field(default_factory=list)
     _tolerances: list[Tolerance] | None = None
+    _accepted: Sequence[Trial] = ()
     _latest: dict[tuple[int, ...], list[Trial]] = field(default_factory=dict)
 
     # ---- tolerated deviations ----
@@ -212,6 +213,7 @@ class State:
     def tolerate(self, accepted: Sequence[Trial]) -> None:
         """Base with the accepted columns and the deviations within their tolerance, but for those of an accepted
         cause: of two equal columns each would take a half."""
+        self._accepted = accepted
         taken = {t.candidate.key for t in accepted}
         entries = [one for one in self.tolerated() if one.of not in taken]
         fixed = [t.rows for t in accepted]
@@ -322,17 +324,18 @@ class State:
     def _by_habits(self, trial: Trial) -> bool:
         """Whether a trial is more than on a healthy arm only beside habits in its rows: the healthy sets were without
         them, and columns of friction share it among them."""
-        habits = [
-            id(rows)
-            for name, rows in zip(self.nuisance, self.nuisance_rows, strict=True)
-            if name.startswith(HABIT) and set(rows) & set(trial.rows)
+        known = self.tolerated()
+        others = [
+            one for one in known if not (one.name.startswith(HABIT) and set(one.rows) & set(trial.rows))
         ]
-        if not habits:
+        if len(others) == len(known):
             return False
-        present = list(self.evidence.extra)
-        self.evidence.replace([rows for rows in present if id(rows) not in habits])
+        present, nuisance, rows = list(self.evidence.extra), self.nuisance, self.nuisance_rows
+        self._tolerances = others
+        self.tolerate(self._accepted)
         alone = self.dictionary.trial(trial.candidate, trial.shape, self.choices(trial))
         found = alone is None or not self.unusual(alone)
+        self._tolerances, self.nuisance, self.nuisance_rows = known, nuisance, rows
         self.evidence.replace(present)
         return found
 
