@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ident.diagnosis import commission, diagnose
 from ident.diagnosis.candidates import Candidate, Trial
-from ident.diagnosis.character import Size, _carried, _kind
+from ident.diagnosis.character import Size, _carried, _kind, _Set
 from ident.diagnosis.evidence import Score
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.kinematics import Chain
@@ -60,6 +61,67 @@ def test_each_harmonic_of_a_ripple_may_be_in_the_model() -> None:
     assert _kind(STRIBECK, Shape(velocity=0.1, exponent=1.0)) == _kind(
         STRIBECK, Shape(velocity=0.2, exponent=2.0)
     )
+
+
+def of_friction(base: tuple[float, float], laws: list[tuple[str, Shape, float]]) -> list[bool]:
+    """Which laws of the speed are part of the friction of joint 2 beside its Coulomb and viscous friction."""
+    speed = np.linspace(0.01, 1.5, 300)
+
+    def column(cause: str, shape: Shape) -> np.ndarray:
+        if cause == "stribeck":
+            return np.exp(-((speed / shape["velocity"]) ** shape["exponent"]))[:, None]
+        return (speed ** shape["exponent"])[:, None]
+
+    side = SimpleNamespace(
+        valid=np.ones((300, 2), dtype=bool), matrix=np.stack([np.column_stack([np.ones(300), speed])] * 2)
+    )
+    nominal = SimpleNamespace(rows={"motor": side}, base=SimpleNamespace(names=("Fcm2", "Fvm2")))
+    sizes = [np.array([size]) for *_, size in laws]
+    evidence = SimpleNamespace(
+        extra=[],
+        base_count=2,
+        full=SimpleNamespace(values=np.array(base)),
+        replace=lambda extra: None,
+        coefficients=lambda: sizes,
+    )
+    bench = SimpleNamespace(nominal=nominal, evidence=evidence, dictionary=None)
+    score = Score(1.0, 1.0, np.ones(1), 0.02, lambda: (np.eye(1), 40))
+    trials = [
+        Trial(Candidate(EFFECTS[cause], 1), shape, score, {("motor", 1): column(cause, shape)})
+        for cause, shape, _ in laws
+    ]
+    return _Set(bench, DiagnosisSettings()).parts(trials)  # type: ignore[arg-type]
+
+
+def test_a_law_of_the_speed_is_no_larger_than_the_friction_it_belongs_to() -> None:
+    power, slow = Shape(exponent=0.94), Shape(velocity=0.08, exponent=0.5)
+    assert of_friction((7.5, 5.0), [("viscous_nonlinear", Shape(exponent=0.6), 8.0)]) == [True]
+    assert of_friction((9.4, -1.3), [("viscous_nonlinear", Shape(exponent=0.83), 13.4)]) == [True]
+    assert of_friction((7.8, -24.4), [("viscous_nonlinear", power, 37.1)]) == [False]
+    assert of_friction((7.8, 5.0), [("stribeck", slow, 2.0)]) == [True]
+    assert of_friction((7.8, 5.0), [("stribeck", slow, 84.0)]) == [False]
+    pair = [("stribeck", slow, 424.7), ("stribeck", slow.at(velocity=0.0803), -421.9)]
+    assert of_friction((9.4, 5.0), pair) == [False, False]
+
+
+def test_an_accepted_effect_stays_once_whatever_its_size_in_a_set_of_less_noise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def bench() -> SimpleNamespace:
+        dictionary = SimpleNamespace(
+            trial=lambda candidate, shape, choices=1: None,
+            rows=lambda candidate, shape: {("motor", 1): np.ones((3, 1))},
+            measure=lambda candidate, rows: trial(-0.1, 5.0).score,
+        )
+        return SimpleNamespace(dictionary=dictionary, evidence=None)
+
+    monkeypatch.setattr("ident.diagnosis.character.again_with", lambda *_: bench())
+    monkeypatch.setattr("ident.diagnosis.character.State.tolerate", lambda self, accepted: None)
+    monkeypatch.setattr("ident.diagnosis.character.State.simplest", lambda self: [trial(0.3, 90.0)])
+    one = _Set(bench(), DiagnosisSettings(), [trial(0.4, 90.0)])  # type: ignore[arg-type]
+    quieter = one.quieter(["stribeck"])
+    assert [t.candidate.key for t in quieter.accepted] == [STRIBECK.key]
+    assert not quieter.found()
 
 
 def sticky(make: Make, day: int, amplitude: float) -> list[Session]:

@@ -23,6 +23,7 @@ from ident.diagnosis.nominal import GAIN_STD, NominalArm
 from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.diagnosis.selection import State
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.diagnosis.tolerances import Tolerance
 from ident.diagnosis.usual_sizes import Healthy
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
@@ -262,6 +263,34 @@ def test_habits_of_healthy_days_are_tolerated_beside_every_cause(chain: Chain) -
     usual["cable_spring"] = True
     # Far below the best candidate it changes little.
     assert not state.habit([trials["gear_ripple"], trials["cable_spring"]])
+
+
+def test_what_is_unusual_beside_a_habit_alone_is_no_claim(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Healthy sets were without the habit, and columns of the same friction share it."""
+    here = {("motor", 0): np.ones((3, 1))}
+    habit = Tolerance("habit 1: stribeck 1", here, 1.0, np.inf, ("stribeck", 0))
+    trial = Trial(Candidate(EFFECTS["viscous_nonlinear"], 0), Shape(exponent=0.4), _score(900.0), here)
+    clear = replace(trial.score, robust=lambda: (1e-4 * np.eye(1), 40))
+    trial = replace(trial, score=clear)
+    elsewhere = replace(trial, rows={("motor", 1): np.ones((3, 1))})
+
+    def state(alone: float) -> State:
+        dictionary = SimpleNamespace(trial=lambda *_: replace(trial, score=_score(alone)))
+        evidence = SimpleNamespace(extra=[here], replace=lambda extra: None)
+        found = State(dictionary, evidence, DiagnosisSettings())  # type: ignore[arg-type]
+        found._tolerances = [habit]
+        return found
+
+    monkeypatch.setattr(State, "tolerate", lambda self, accepted: None)
+    monkeypatch.setattr(State, "unusual", lambda self, trial: trial.score.gain > 500.0)
+    monkeypatch.setattr(State, "usual", lambda self, trial: 0.0)
+    assert not state(100.0).carried(trial)
+    assert state(800.0).carried(trial)
+    assert state(100.0).carried(elsewhere)
+    assert state(100.0).carried(trial, healthy=False)
+    kept = state(100.0)
+    kept.carried(trial)
+    assert kept.tolerated() == [habit]
 
 
 def test_a_limit_grows_with_the_information_of_the_motion_and_falls_with_none() -> None:

@@ -217,3 +217,42 @@ def test_a_gain_beyond_the_usual_is_told_with_its_own_size(
     # That of other days is in its interval.
     assert reference.gain_std < error.std < 0.3 * true
     assert error.value == pytest.approx(true, abs=3.0 * error.std)
+
+
+def bent(share: float) -> Callable[[Signals], None]:
+    """A further law in the friction of joint 2, all of which is larger by a share."""
+
+    def change(s: Signals) -> None:
+        v = s["qd"][:, 1]
+        law = 1.5 * np.sign(v) * np.abs(v) ** 0.4
+        s["motor"][:, 1] += law + share * (1.5 * np.sign(v) + 2.5 * v + law)
+
+    return change
+
+
+def test_wear_of_a_drive_with_a_law_of_its_own_is_a_share_of_its_whole_friction(
+    make: Make, chain: Chain
+) -> None:
+    """Coulomb and viscous friction and the law are hardly independent; only their sum is known."""
+    healthy = commission([pair(make, bent(0.0), seed=11), pair(make, bent(0.0), seed=21)], chain)
+    assert ("viscous_nonlinear", [2]) in [(e["cause"], e["joints"]) for e in healthy.model.effects]
+    sessions = pair(make, bent(0.5), seed=31)
+    found = diagnose(sessions, chain, reference=healthy)
+    (finding,) = found.findings
+    assert (finding.cause, finding.joints) == ("wear", (2,))
+    for name in ("coulomb", "viscous"):
+        assert finding.parameters[name].value == pytest.approx(0.5, abs=0.1)
+    speed = np.concatenate([np.gradient(s.joint.position[:, 1], 1e-9 * s.joint.log_time) for s in sessions])
+    law = np.sign(speed) * (1.5 + 2.5 * np.abs(speed) + 1.5 * np.abs(speed) ** 0.4)
+    assert finding.evidence.test_rms_before == pytest.approx(0.5 * np.sqrt(np.mean(law**2)), rel=0.25)
+
+
+def test_a_habit_of_friction_is_a_share_of_the_whole_law() -> None:
+    """A viscous part near zero beside a law of the speed changes as much as the two together."""
+    names, tiny = ("Fvm1", "Fvm2"), np.eye(2) * 1e-8
+    days = [np.array([0.1, 8.0]), np.array([-0.9, 8.8])]
+    whole = habit(names, days, [tiny, tiny], {}, sizes=np.array([10.0, 8.4]))
+    assert np.all(np.sqrt(whole) < 0.1 * np.array([10.0, 8.4]))
+    assert np.sqrt(whole[0]) > 0.5
+    # Of its own size it would make the other joint's as uncertain as a whole.
+    assert np.sqrt(habit(names, days, [tiny, tiny], {})[1]) > 0.5 * 8.4
