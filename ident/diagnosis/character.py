@@ -299,8 +299,9 @@ def _entries(sets: Sequence[_Set], chosen: Sequence[tuple[Candidate, Shape]]) ->
     """Entries of effects with their sizes fitted together in each set, without those that do not last or that no drive
     has in that size."""
     chosen = list(chosen)
+    table = [[one.take(*each) for each in chosen] for one in sets]
     while chosen:
-        fits = [_fitted(one, chosen) for one in sets]
+        fits = [_fitted(one, trials) for one, trials in zip(sets, table, strict=True)]
         sizes = [
             Size.of([fit[k][0] for fit in fits], [fit[k][1] for fit in fits], candidate.effect.usual_change)
             for k, (candidate, _) in enumerate(chosen)
@@ -314,7 +315,10 @@ def _entries(sets: Sequence[_Set], chosen: Sequence[tuple[Candidate, Shape]]) ->
         if not unsound:
             break
         # Without the least certain one the others may be sound.
-        chosen.pop(min(unsound, key=lambda k: sizes[k].certainty))
+        least = min(unsound, key=lambda k: sizes[k].certainty)
+        chosen.pop(least)
+        for trials in table:
+            trials.pop(least)
     found = []
     for k, (candidate, shape) in enumerate(chosen):
         each = [fit[k][0] for fit in fits]
@@ -324,10 +328,10 @@ def _entries(sets: Sequence[_Set], chosen: Sequence[tuple[Candidate, Shape]]) ->
     return found
 
 
-def _fitted(one: _Set, chosen: Sequence[tuple[Candidate, Shape]]) -> list[tuple[Floats, Floats, bool]]:
+def _fitted(one: _Set, trials: Sequence[Trial]) -> list[tuple[Floats, Floats, bool]]:
     """Coefficients (k,) of effects fitted together, their covariance (k, k), and whether they are part of the
     friction, see `_Set.parts`."""
-    evidence, trials = one.bench.evidence, [one.take(*each) for each in chosen]
+    evidence = one.bench.evidence
     evidence.replace([*(trial.rows for trial in trials), *one.state.nuisance_rows])
     covariance, place, found = evidence.covariance(), evidence.base_count, []
     for value, part in zip(evidence.coefficients(), one.parts(trials), strict=False):
