@@ -332,6 +332,12 @@ class Dictionary:
             }
         return self._information[candidate.key]
 
+    def products(self, candidate: Candidate) -> Iterator[Products]:
+        """Products of each shape of a candidate's grid with the base alone; none for events."""
+        effect = candidate.effect
+        entries = [] if effect.repeats or effect.step or effect.event else self._prepared(candidate)
+        return (known for _, _, known in entries)
+
     def scores(self, candidate: Candidate) -> dict[str, Score]:
         """Score of each shape of a candidate's grid beside the present columns, by the shape as text; empty for
         events."""

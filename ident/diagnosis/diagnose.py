@@ -30,7 +30,7 @@ from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import confirmed_delay
 from ident.diagnosis.evidence import Score
 from ident.diagnosis.models import lasting
-from ident.diagnosis.payloads import other_masses, payload_finding, with_masses
+from ident.diagnosis.payloads import other_masses, payload_finding, unstated_body, with_masses
 from ident.diagnosis.recording import record, settled, usual_step
 from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
 from ident.diagnosis.result import Diagnosis, Finding
@@ -113,13 +113,17 @@ def diagnose(
             return _ended(task, broken)
         task, first = _begun(task)
         others = other_masses(first.bench, reference)
-        if others and reference is not None:
+        body = None if reference is None else unstated_body(first.bench, reference)
+        if reference is not None and (others or body is not None):
             # With a mass of its own it pulls at nothing else.
             task = with_masses(task, {one.payload: one.mass for one in others})
+            if body is not None:
+                task = replace(task, reference=reference.carrying(body.values, body.covariance))
             first = _first(task, _bench(task))
         state = _refined(task, _in_time(task, first))
         if reference is not None:
-            state = replace(state, loads=tuple(map(payload_finding, others)))
+            loads = [payload_finding(one) for one in (*others, body) if one is not None]
+            state = replace(state, loads=tuple(loads))
         else:
             state = replace(state, notes=(*state.notes, *(one.text for one in others)))
         found = conclude(task, state)

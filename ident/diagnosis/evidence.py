@@ -549,6 +549,12 @@ class Evidence:
         uncertain = (fit.inverse * pulls) @ fit.inverse
         return fit.values[:p], (self.covariance(fit) + uncertain)[:p, :p]
 
+    def free_inverse(self) -> Floats:
+        """Inverse (p, p) of the base's products without the prior: times those of a column, the change of the base
+        parameters that takes it up."""
+        gram = self._base_gram.sum(axis=0)
+        return _inverse(gram, self._scale[: self.base_count])
+
     @property
     def chi_square(self) -> float:
         """Sum of squares of all fitted rows, in units of their noise."""

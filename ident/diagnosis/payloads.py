@@ -2,7 +2,8 @@
 
 A payload of the healthy arm is tied to its mass. A much heavier or lighter one, under the same label, would pull at
 every other parameter and leave its torque to the gains of the sensors. So it is looked for first, by these sessions
-alone, told as a finding, and then has a mass of its own.
+alone, told as a finding, and then has a mass of its own. So is a body on the flange in all sessions that none of them
+states: held-out rows cannot show it, for the last link's parameters take it up.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import LIMITS, Grounds, probability
-from ident.diagnosis.reference import WEIGHED, Reference, announced_masses
+from ident.diagnosis.evidence import Floats
+from ident.diagnosis.reference import WEIGHED, Reference, announced_masses, last_body
 from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.task import Task
 from ident.dynamics.base_set import BaseSet
@@ -23,6 +25,11 @@ from ident.estimators.estimate import fisher_limit
 
 # Least difference of a mass as a share of the expected one, and the largest probability of such a one by chance.
 _OTHER, _ONE_IN = 0.05, 1e-3
+# Largest mass, first moments and inertias of an unstated body, as standard deviations [kg, kg m, kg m^2].
+_USUAL = np.array([5.0, 1.0, 1.0, 1.0, *[0.3] * 6])
+_TOLD = 4
+# Least size of a combination of a cause's columns, as a share of its largest one.
+_LEAST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -74,6 +81,72 @@ def other_masses(bench: DiagnosisBench, reference: Reference | None) -> list[Oth
     return found
 
 
+@dataclass(frozen=True, eq=False)
+class UnstatedBody:
+    """A body on the last link in all sessions that neither the healthy arm had nor a session states.
+
+    values : (10,) of `LAST_BODY`, covariance (10, 10). square : mass and first moments in squares of their uncertainty;
+    least : the one that is hardly chance.
+    """
+
+    values: Floats
+    covariance: Floats
+    square: float
+    least: float
+
+
+def unstated_body(bench: DiagnosisBench, reference: Reference) -> UnstatedBody | None:
+    """The body by which the base parameters of these sessions alone differ from the healthy arm's, None without one.
+
+    The base parameters take all of it up, so no row shows it. It must be beyond chance beside every other cause that
+    would turn the same parameters, in proportion to what these sessions make of it.
+    """
+    evidence, base = bench.evidence, bench.nominal.base
+    if evidence.prior is None or not evidence.compared:
+        return None
+    kept = list(evidence.extra)
+    evidence.replace([])
+    values, covariance = evidence.free()
+    inverse = evidence.free_inverse()
+    evidence.replace(kept)
+    precision, healthy = evidence.prior
+    tied = np.flatnonzero(np.diag(precision) > 0.0)
+    spread = covariance[np.ix_(tied, tied)] + np.linalg.inv(precision[np.ix_(tied, tied)])
+    white = np.linalg.inv(np.linalg.cholesky(spread))
+    body, off = white @ last_body(base)[tied], white @ (values - healthy)[tied]
+    freedom = bench.nominal.arm.chain.n * max(reference.sets, 1)
+    least = _TOLD * fisher_limit(_ONE_IN, _TOLD, freedom)
+    found, uncertain = _solved(body, off)
+    square = _square(found, uncertain)
+    if square <= least:
+        return None
+    for candidate in bench.dictionary.candidates:
+        if candidate.effect is PAYLOAD_ERROR:
+            continue
+        for products in bench.dictionary.products(candidate):
+            turned = white @ (inverse @ products.alone.sum(axis=0).T)[tied]
+            if _square(*_solved(body, off, turned)) <= least:
+                return None
+    return UnstatedBody(found, uncertain, square, least)
+
+
+def _solved(body: Floats, off: Floats, beside: Floats | None = None) -> tuple[Floats, Floats]:
+    """Parameters (10,) of a body and their covariance, from differences `off` (p,) of unit variance and their columns
+    `body` (p, 10); beside : further columns (p, k)."""
+    if beside is not None:
+        # What another cause explains is left out of both.
+        columns, sizes, _ = np.linalg.svd(beside, full_matrices=False)
+        other = columns[:, sizes > _LEAST * sizes[0]]
+        body, off = body - other @ (other.T @ body), off - other @ (other.T @ off)
+    covariance: Floats = np.asarray(np.linalg.inv(body.T @ body + np.diag(_USUAL**-2.0)), dtype=np.float64)
+    return np.asarray(covariance @ (body.T @ off)), covariance
+
+
+def _square(values: Floats, covariance: Floats) -> float:
+    told = values[:_TOLD]
+    return float(told @ np.linalg.solve(covariance[:_TOLD, :_TOLD], told))
+
+
 def unchecked_masses(base: BaseSet, masses: Mapping[str, float | None], reference: Reference) -> list[str]:
     """Payloads with a stated mass [kg] that nothing is held against: not the healthy arm's, and in one base parameter
     with the last link."""
@@ -92,8 +165,14 @@ def _healthy(bench: DiagnosisBench, reference: Reference) -> dict[int, tuple[flo
     return {b: (float(own.values[a]), float(own.covariance[a, a])) for a, b in pairs}
 
 
-def payload_finding(one: OtherMass) -> Finding:
-    """The finding of a payload of another mass."""
+def payload_finding(one: OtherMass | UnstatedBody) -> Finding:
+    """The finding of a payload of another mass, or of a body that no session states."""
+    if isinstance(one, OtherMass):
+        parameters = {"mass": Value(one.mass - one.expected, one.std, "kg")}
+    else:
+        stds = np.sqrt(np.diag(one.covariance)).tolist()
+        known = zip(PAYLOAD_ERROR.parameters, one.values.tolist(), stds, strict=False)
+        parameters = {p.name: Value(value, std, p.unit) for p, value, std in known}
     grounds = Grounds(
         gain=float(np.log(one.square / one.least)),
         significance=LIMITS["significance"][1],
@@ -108,7 +187,7 @@ def payload_finding(one: OtherMass) -> Finding:
         PAYLOAD_ERROR.cause,
         PAYLOAD_ERROR.side,
         (),
-        {"mass": Value(one.mass - one.expected, one.std, "kg")},
+        parameters,
         Evident(-one.square, 1e-12, 0.0, 0.0, (0.0, 0.0)),
         probability(grounds),
         (),

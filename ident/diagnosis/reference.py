@@ -38,6 +38,8 @@ USUAL_DAYS = 4
 """Weight of the usual deviation of a delay, in days."""
 USUAL_CHANGES = 2.0
 """Weight of the usual change of a parameter, a gain or the size of an effect beside this arm's own, in changes."""
+LAST_BODY = ("M", "MX", "MY", "MZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
+"""Inertial parameters of a body on the last link: those that are told first."""
 
 _KEY = "commissioning"
 _WIDER = 1.5
@@ -253,6 +255,18 @@ class Reference:
                         found[effect.cause, joint] = max(limit, found.get((effect.cause, joint), 0.0))
         return found
 
+    def carrying(self, values: Floats, covariance: Floats) -> Reference:
+        """The same with a further body on the last link: its parameters (10,) of `LAST_BODY`, covariance (10, 10)."""
+        model = self.model
+        if model.covariance is None or model.base is None:
+            return self
+        body = last_body(model.base)[model.positions]
+        more = body @ covariance @ body.T
+        return replace(
+            self,
+            model=replace(model, values=model.values + body @ values, covariance=model.covariance + more),
+        )
+
     def loosened(self, symbol: str, share: float) -> Reference:
         """The same with parameters of a symbol, such as `Ia`, uncertain by at least that share of their value."""
         model = self.model
@@ -380,6 +394,12 @@ def _share_of_ranges(beyond: Floats, scale: Floats, ranges: Floats) -> float:
         return 0.0
     likelier = np.sum(np.log(of_ranges * ranges**2)) < np.sum(np.log(of_torques * scale**2))
     return of_ranges if likelier else 0.0
+
+
+def last_body(base: BaseSet) -> Floats:
+    """Base parameters (p, 10) of a unit of each of `LAST_BODY` on the last link."""
+    structure = base.structure
+    return base.matrix[:, [structure.names.index(f"{symbol}{structure.chain.n}") for symbol in LAST_BODY]]
 
 
 def joint_of(name: str) -> int:

@@ -14,9 +14,10 @@ from ident.diagnosis.payloads import (
     other_masses,
     payload_finding,
     unchecked_masses,
+    unstated_body,
     with_masses,
 )
-from ident.diagnosis.reference import Reference, announced_masses
+from ident.diagnosis.reference import Reference, announced_masses, last_body
 from ident.diagnosis.task import Task
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
@@ -96,3 +97,44 @@ def test_a_payload_gets_its_own_mass_in_its_recordings_alone() -> None:
     task = Task((), (), None, (Recording("weight", 2.0), Recording(None, None)), None, None, None, None, None)  # type: ignore[arg-type]
     changed = with_masses(task, {"weight": 2.6})
     assert [one.payload_mass for one in changed.recordings] == [2.6, None]
+
+
+BODY = np.array([0.4, 0.02, 0.01, 0.03, *[0.0] * 6])
+
+
+def carried(base: BaseSet, healthy: Reference, body: Any, turned: tuple[Any, ...] = ()) -> Any:
+    """A bench of sessions with a body on the last link, and causes that turn the base parameters."""
+    values = healthy.model.values + last_body(base) @ body
+    said = bench(base, 2.0, 0.01)
+    said.evidence.prior = (np.linalg.inv(healthy.model.covariance), healthy.model.values)
+    said.evidence.compared = True
+    said.evidence.free = lambda: (values, 1e-8 * np.eye(len(base)))
+    said.evidence.free_inverse = lambda: np.eye(len(base))
+    products = [SimpleNamespace(alone=np.reshape(one, (1, 1, -1))) for one in turned]
+    causes = [SimpleNamespace(effect=None, products=one) for one in products]
+    said.dictionary = SimpleNamespace(candidates=causes, products=lambda cause: [cause.products])
+    return said
+
+
+def test_a_body_that_no_session_states_shows_against_the_healthy_arm(base: BaseSet) -> None:
+    arm = healthy(base, 2.0, 0.02)
+    found = unstated_body(carried(base, arm, BODY), arm)
+    assert found is not None
+    assert found.values[:4] == pytest.approx(BODY[:4], abs=2e-3)
+    told = payload_finding(found)
+    assert list(told.parameters) == ["mass", "moment_x", "moment_y", "moment_z"]
+    assert told.parameters["mass"].value == pytest.approx(0.4, abs=2e-3)
+    # With it the healthy arm is that of these sessions.
+    again = arm.carrying(found.values, found.covariance)
+    assert np.allclose(again.model.values, arm.model.values + last_body(base) @ found.values)
+    assert unstated_body(carried(base, again, 0.0 * BODY), again) is None
+
+
+def test_no_body_is_told_that_another_cause_or_chance_explains(base: BaseSet) -> None:
+    arm = healthy(base, 2.0, 0.02)
+    change = last_body(base) @ BODY
+    assert unstated_body(carried(base, arm, 1e-3 * BODY), arm) is None
+    assert unstated_body(carried(base, arm, BODY, (change,)), arm) is None
+    other = np.zeros(len(base))
+    other[0] = 1.0
+    assert unstated_body(carried(base, arm, BODY, (other,)), arm) is not None
