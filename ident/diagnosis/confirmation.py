@@ -141,15 +141,21 @@ def _refuted(
 
     fallen : interval of the fall of their chi-square by it; above zero it confirms the claim. hardly : the held-out
     sessions hardly excite the cause, so they need only not contradict it. A cause with ample evidence in the rows
-    fitted, or almost confirmed by the others, may be this one or another.
+    fitted, or almost confirmed by the others, may be this one or another, if what it takes off their error is felt.
     """
     low, high = fallen
     if _untested(claim, finding) or low > 0.0:
         return False
+    if hardly and high > -_ALL_BUT * claim.gain:
+        return False
     least = claim.trial.candidate.effect.evidence_factor * bench.evidence.settings.least_gain
-    shown = low + high > 0.0 and claim.gain > _TO_SPARE * least
-    silent = hardly and high > -_ALL_BUT * claim.gain
-    return not (shown or silent or low > -_ALL_BUT * high)
+    likely = low + high > 0.0 and claim.gain > _TO_SPARE * least
+    return not (likely or low > -_ALL_BUT * high) or (not hardly and _share(finding) < _FELT)
+
+
+def _share(finding: Finding) -> float:
+    """Share of the held-out error of its rows that a finding takes away."""
+    return 1.0 - finding.evidence.test_rms_after / max(finding.evidence.test_rms_before, 1e-12)
 
 
 def _plain(
@@ -189,7 +195,6 @@ def _grounds(
     effect, shown, (low, high) = claim.trial.candidate.effect, finding.evidence, fallen
     least = effect.evidence_factor * bench.evidence.settings.least_gain
     sure = min(max(claim.confidence, 1e-6), 1.0 - 1e-6)
-    before = max(shown.test_rms_before, 1e-12)
     # What the samples themselves show needs no significance by blocks.
     p_value = 0.0 if effect.seen_in_samples(claim.trial.shape) else shown.p_value
     acting = {key for key, columns in claim.trial.rows.items() if np.any(columns)}
@@ -199,7 +204,7 @@ def _grounds(
         rivals=math.log(sure / (1.0 - sure)),
         held_out=0.0 if untested else (low + high) / max(high - low, 1e-12),
         untested=float(untested),
-        felt=0.0 if untested else 1.0 - shown.test_rms_after / before,
+        felt=0.0 if untested else _share(finding),
         one_block=float(not untested and not spread_out(without, after, list(claim.trial.rows))),
         worse=float(not untested and bool(worse_rows(without, after, seed, acting))),
         habitual=float(effect.character),
