@@ -10,7 +10,7 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
+from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score, chance
 from ident.diagnosis.nominal import Nominal, SideRows
 from ident.diagnosis.recording import sensor_limits
 from ident.diagnosis.settings import A_COEFFICIENT
@@ -319,7 +319,18 @@ class Dictionary:
             better = best is None or _worth(score) > _worth(best.score)
             if better and candidate.effect.plausible(score.coefficients, shape):
                 best = Trial(candidate, shape, score, rows)
-        return best
+        return None if best is None else self._simplified(best)
+
+    def _simplified(self, trial: Trial) -> Trial:
+        """The trial in its simpler form if the blocks do not tell its further coefficients from zero."""
+        shape = trial.candidate.effect.simpler(trial.shape)
+        plain = None if shape is None else self.trial(trial.candidate, shape)
+        if plain is None:
+            return trial
+        kept, (covariance, blocks) = len(plain.score.coefficients), trial.score.uncertainty
+        further = trial.score.coefficients[kept:]
+        sure = chance(further, covariance[kept:, kept:], blocks) < self.evidence.settings.alpha_rare
+        return trial if sure else plain
 
     def information(self, candidate: Candidate) -> dict[str, float]:
         """How much these motions show of a candidate, by shape of its grid: the mean fall of the chi-square for a unit

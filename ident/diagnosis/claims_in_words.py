@@ -21,9 +21,10 @@ WIDTH = 100
 
 _SEEN = {
     "motor": "Seen in the motor torque only.",
-    "joint": "Acts on the links, so both torques see it.",
+    "joint": "Acts on the links.",
     "sensor": "An error of the joint torque sensor.",
 }
+_SEEN_BY_BOTH = "Acts on the links, so both torques see it."
 
 
 @dataclass(frozen=True)
@@ -79,9 +80,9 @@ def values_of(finding: Plain) -> dict[str, tuple[float, float, str]]:
 
 
 def finding_statement(
-    number: int, finding: Plain, names: Sequence[str], sure: float = SURE
+    number: int, finding: Plain, names: Sequence[str], sure: float = SURE, *, both: bool = False
 ) -> FindingStatement:
-    """A finding in words."""
+    """A finding in words. both : whether the sessions have both torques."""
     cause, mode, side = str(finding["cause"]), finding.get("mode"), str(finding.get("side", ""))
     counted = cause in EFFECTS and EFFECTS[cause].counted
     meaning = ""
@@ -90,6 +91,7 @@ def finding_statement(
     elif finding.get("parameters"):
         meaning = f"{summary_of(cause)}: {described(cause, values_of(finding), finding.get('form'), names)}"
         meaning += f", {mode} sessions." if mode else "."
+    seen = _SEEN_BY_BOTH if both and side == "joint" else _SEEN.get(side, "")
     confidence, others = finding.get("confidence"), finding.get("alternatives") or []
     open_ = is_open(confidence, others, sure)
     known = "no confidence given" if confidence is None else f"confidence {confidence:.2f}"
@@ -111,7 +113,7 @@ def finding_statement(
         number,
         cause,
         placed(finding, names, always=True),
-        " ".join(part for part in (capital(meaning), _SEEN.get(side, "")) if part),
+        " ".join(part for part in (capital(meaning), seen) if part),
         known + (", open between look-alikes" if open_ else ""),
         tuple(facts),
         tuple(_statistics(finding)),

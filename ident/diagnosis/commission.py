@@ -418,10 +418,15 @@ def _middle(arms: Sequence[NominalArm]) -> NominalArm:
 def as_stated(arm: NominalArm, sets: Sequence[Floats]) -> NominalArm:
     """The arm with the standard error of its compliance from those of the sets (n,) [rad/Nm], and with the stated one,
     known to a factor, where encoders at the motors do not tell it: the sets do not agree on one, or end at that factor.
+    Behind encoders at the links a stated one that no set shows is unknown.
     """
     std = compliance_std(sets)
-    if arm.encoder == "link" or arm.stated is None:
+    if arm.stated is None:
         return replace(arm, compliance_std=std)
+    if arm.encoder == "link":
+        # A fit that ends at a rigid joint in every set does not differ from set to set.
+        ended = (arm.compliance <= 0.0) & (arm.stated > 0.0)
+        return replace(arm, compliance_std=None if std is None else np.where(ended, UNSURE * arm.stated, std))
     factors = np.array(sets) / np.maximum(arm.stated, 1e-300)
     ends = np.any((factors < _END / STATED_WITHIN) | (factors > STATED_WITHIN / _END), axis=0)
     unknown = (arm.stated > 0.0) & (ends | unsure(arm.compliance, std))

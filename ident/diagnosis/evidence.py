@@ -57,20 +57,21 @@ class Score:
     chance: float | None = None
 
     @cached_property
-    def _robust(self) -> tuple[Floats, int]:
+    def uncertainty(self) -> tuple[Floats, int]:
+        """Covariance (k, k) from blocks, and their number."""
         return self.robust()
 
     @property
     def covariance(self) -> Floats:
         """(k, k), from blocks."""
-        return self._robust[0]
+        return self.uncertainty[0]
 
     @cached_property
     def p_value(self) -> float:
         """Probability of such coefficients where all are zero."""
         if self.chance is not None:
             return self.chance
-        return chance(self.coefficients, *self._robust)
+        return chance(self.coefficients, *self.uncertainty)
 
 
 def chance(coefficients: Floats, covariance: Floats, blocks: int) -> float:

@@ -509,11 +509,15 @@ class State:
     def leftover(self, trial: Trial, others: Sequence[Trial]) -> bool:
         """Whether a trial is a remainder of the others.
 
-        It is one if it follows from another, if the least error of a stronger one's law explains it in the rows of
-        that joint, or if it lacks evidence beside model-form errors of the stronger ones in its rows.
+        It is one if it follows from another or is a weaker push at the same moment, if the least error of a stronger
+        one's law explains it in the rows of that joint, or if it lacks evidence beside model-form errors of the
+        stronger ones in its rows.
         """
         wide = []
         if any(_follows(trial, other) for other in others):
+            return True
+        if any(_same_moment(trial, other) and other.score.gain > trial.score.gain for other in others):
+            # A search of times may end at the push beside it.
             return True
         for other in others:
             stronger = other.score.gain > trial.score.gain or _is_its_mean(trial, other)

@@ -147,7 +147,10 @@ def statements(
     """The statements of a diagnosis. names : of the joints. answers : of decision.json."""
     sure = float(details.get("sure", SURE))
     claims = [*content.get("findings", []), *content.get("character", [])]
-    said = [finding_statement(number, one, names, sure) for number, one in enumerate(claims, start=1)]
+    both = sum(map(bool, ((content.get("baseline") or {}).get("noise_floor") or {}).values())) > 1
+    said = [
+        finding_statement(number, one, names, sure, both=both) for number, one in enumerate(claims, start=1)
+    ]
     count = len(content.get("findings", []))
     findings, character = said[:count], said[count:]
     level, headline = _headline(content, details, findings)

@@ -378,6 +378,10 @@ class Effect(ABC):
         """The independent variable of its torque, with these parameters."""
         return self.depends_on
 
+    def simpler(self, shape: Shape) -> Shape | None:
+        """A shape with the first of this one's columns alone, or None: the one to tell if the others may be zero."""
+        return None
+
     # ---- beside other causes ----
 
     def follows_from(self, shape: Shape, coefficients: Floats, other: Effect, at: Shape, of: Floats) -> bool:

@@ -322,6 +322,10 @@ class CableSpring(Effect):
             return bool(coefficients[0] + coefficients[2] >= 0.0)
         return bool(coefficients[0] >= 0.0)
 
+    def simpler(self, shape: Shape) -> Shape | None:
+        """A hardening spring that does not harden is a linear one."""
+        return Shape(_Spring.LINEAR) if shape.form is _Spring.HARDENING else None
+
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """The same torque on both sides."""
         if shape.form is _Spring.TWO_JOINTS:

@@ -170,6 +170,12 @@ def test_a_stiffness_that_the_sets_do_not_tell_is_the_stated_one(arm: NominalArm
     np.testing.assert_allclose(single.compliance, [0.8e-4, 0.6e-4, 1e-4])
     before = as_stated(replace(behind, encoder="link"), sets)
     np.testing.assert_array_equal(before.compliance, behind.compliance)
+    # A fit that ends at a rigid joint in each set knows no stiffness of a joint that is stated elastic.
+    rigid = [np.array([0.8e-4, 0.0, 0.0])] * 2
+    ended = replace(
+        behind, encoder="link", compliance=rigid[0], stated=stated * (1.0, 1.0, 0.0), compliance_std=None
+    )
+    np.testing.assert_allclose(as_stated(ended, rigid).compliance_std, [0.0, 0.5e-4, 0.0])
 
 
 def test_rounds_of_a_fit_stay_near_the_stated_stiffness(

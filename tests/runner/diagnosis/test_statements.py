@@ -123,3 +123,13 @@ def test_a_worse_replay_is_pointed_out() -> None:
     line = next(one for one in statements(CONTENT, details(), NAMES).lines if one.anchor == "replay")
     assert line.level == "look"
     assert "position 2.65 -> 5.29 mrad" in line.found
+
+
+def test_a_cause_on_the_links_is_in_the_torques_that_there_are() -> None:
+    tilt = {**FINDING, "cause": "base_tilt", "side": "joint", "joints": [], "parameters": {}}
+    for motor, both in (([0.1] * 7, True), (None, False)):
+        floors = {"motor": motor, "joint": [0.1] * 7}
+        content = {**CONTENT, "findings": [tilt], "baseline": {"noise_floor": floors}}
+        (finding,) = statements(content, details(), NAMES).findings
+        assert "Acts on the links" in finding.text
+        assert ("both torques see it" in finding.text) == both
