@@ -43,6 +43,8 @@ _LEAST_HABIT, _NEAR, _MOST_HABITS = 100.0, 0.5, 4
 _LEAST_GAIN = 10.0
 # Confidence in a sensor's error with a record of the joint torque only.
 _SHAPE_ALONE = 0.7
+# Least probability of a claim without a look-alike.
+_SURE = 0.8
 # Confidence in one of two causes of the same torque in these motions.
 _EITHER = 0.5
 # A change of a length over its standard deviation.
@@ -559,7 +561,7 @@ class State:
         close = self.competing(again, [self.dictionary.refine(t, self.choices(t)) for t in close], rest)
         scores = sorted(((t.candidate, _gain(t)) for t in close), key=lambda pair: -pair[1])
         sure = confidence(_gain(again), [g for _, g in scores])
-        alike = tuple((c, g) for c, g in scores if _gain(again) - g < margin(_gain(again)))
+        alike = look_alikes(_gain(again), scores, sure)
         if here.candidate.effect.side == "sensor" and "motor" not in self.dictionary.nominal.rows:
             # Without a motor torque only the shape distinguishes a sensor's error from a torque of the arm.
             sure = min(sure, _SHAPE_ALONE)
@@ -582,6 +584,15 @@ class State:
         """The candidate of the same torque in these sessions, by the physics of the effect."""
         cause = candidate.effect.same_as(self.dictionary.setting, candidate.joint)
         return next((c for c in self.dictionary.candidates if c.key == (cause, candidate.joint)), None)
+
+
+def look_alikes(
+    gain: float, rivals: Sequence[tuple[Candidate, float]], sure: float
+) -> tuple[tuple[Candidate, float], ...]:
+    """The rivals, best first, that a cause of a gain is not distinguishable from; the best one at least where rivals
+    leave it a probability `sure` below that of a sure claim."""
+    alike = tuple((rival, other) for rival, other in rivals if gain - other < margin(gain))
+    return alike or (tuple(rivals[:1]) if sure < _SURE else ())
 
 
 def margin(gain: float) -> float:

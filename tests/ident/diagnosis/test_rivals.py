@@ -8,7 +8,7 @@ import numpy as np
 
 from ident.diagnosis import DiagnosisSettings
 from ident.diagnosis.candidates import Candidate, Trial
-from ident.diagnosis.selection import State
+from ident.diagnosis.selection import State, confidence, look_alikes
 from ident.diagnosis.signatures import signature_bench
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, Shape
@@ -85,3 +85,13 @@ def test_what_two_look_alikes_share_counts_for_the_other_one(
     assert other.shape == shapes[0]
     assert np.isclose(other.score.gain, alone[0].score.gain)
     assert other.score.gain > 5.0 * max(beside, 1.0)
+
+
+def test_a_claim_that_rivals_make_unsure_lists_the_nearest() -> None:
+    first, second = (Candidate(EFFECTS[cause], 1) for cause in ("stribeck", "gear_ripple"))
+    # Both beyond the margin of 112: each leaves it sure, both together do not.
+    one, both = [(first, 885.0)], [(first, 885.0), (second, 880.0)]
+    assert confidence(1000.0, [g for _, g in one]) > 0.8 > confidence(1000.0, [g for _, g in both])
+    assert look_alikes(1000.0, one, confidence(1000.0, [885.0])) == ()
+    assert look_alikes(1000.0, both, confidence(1000.0, [885.0, 880.0])) == ((first, 885.0),)
+    assert look_alikes(1000.0, [(first, 900.0), (second, 895.0)], 0.7) == ((first, 900.0), (second, 895.0))
