@@ -102,14 +102,16 @@ def unstated_body(bench: DiagnosisBench, reference: Reference) -> UnstatedBody |
     would turn the same parameters, in proportion to what these sessions make of it.
     """
     evidence, base = bench.evidence, bench.nominal.base
-    if evidence.prior is None or not evidence.compared:
+    # The limit itself accounts for the few days behind the variances.
+    prior = reference.prior(base, bench.nominal.masses, wider=1.0)
+    if prior is None or not evidence.compared:
         return None
     kept = list(evidence.extra)
     evidence.replace([])
     values, covariance = evidence.free()
     inverse = evidence.free_inverse()
     evidence.replace(kept)
-    precision, healthy = evidence.prior
+    precision, healthy = prior
     tied = np.flatnonzero(np.diag(precision) > 0.0)
     spread = covariance[np.ix_(tied, tied)] + np.linalg.inv(precision[np.ix_(tied, tied)])
     white = np.linalg.inv(np.linalg.cholesky(spread))

@@ -106,7 +106,6 @@ def carried(base: BaseSet, healthy: Reference, body: Any, turned: tuple[Any, ...
     """A bench of sessions with a body on the last link, and causes that turn the base parameters."""
     values = healthy.model.values + last_body(base) @ body
     said = bench(base, 2.0, 0.01)
-    said.evidence.prior = (np.linalg.inv(healthy.model.covariance), healthy.model.values)
     said.evidence.compared = True
     said.evidence.free = lambda: (values, 1e-8 * np.eye(len(base)))
     said.evidence.free_inverse = lambda: np.eye(len(base))
