@@ -35,7 +35,7 @@ _LEAST = 1e-6
 @dataclass(frozen=True)
 class OtherMass:
     """A payload whose mass by these sessions alone is not the expected one [kg]. std : of the difference; least :
-    difference in squares of `std` that is hardly chance.
+    difference in squares of `std` that is hardly chance. fall : of the chi-square of the rows by the other mass.
     """
 
     payload: str
@@ -43,6 +43,7 @@ class OtherMass:
     expected: float
     std: float
     least: float
+    fall: float
 
     @property
     def square(self) -> float:
@@ -67,6 +68,7 @@ def other_masses(bench: DiagnosisBench, reference: Reference | None) -> list[Oth
     kept = list(evidence.extra)
     evidence.replace([])
     values, covariance = evidence.free()
+    inverse = evidence.free_inverse()
     evidence.replace(kept)
     healthy = {} if reference is None else _healthy(bench, reference)
     freedom = bench.nominal.arm.chain.n * max(1 if reference is None else reference.sets, 1)
@@ -75,7 +77,8 @@ def other_masses(bench: DiagnosisBench, reference: Reference | None) -> list[Oth
     for k, (payload, stated) in announced.items():
         expected, usual = healthy.get(k, (stated, (WEIGHED * stated) ** 2))
         std = float(np.sqrt(max(covariance[k, k], 0.0) + usual))
-        one = OtherMass(payload, float(values[k]), expected, std, least)
+        fall = (float(values[k]) - expected) ** 2 / max(float(inverse[k, k]), 1e-300)
+        one = OtherMass(payload, float(values[k]), expected, std, least, fall)
         if abs(one.mass - expected) > _OTHER * expected and one.square > least:
             found.append(one)
     return found
@@ -86,13 +89,14 @@ class UnstatedBody:
     """A body on the last link in all sessions that neither the healthy arm had nor a session states.
 
     values : (10,) of `LAST_BODY`, covariance (10, 10). square : mass and first moments in squares of their uncertainty;
-    least : the one that is hardly chance.
+    least : the one that is hardly chance. fall : of the chi-square of the rows, held against the arm without it.
     """
 
     values: Floats
     covariance: Floats
     square: float
     least: float
+    fall: float
 
 
 def unstated_body(bench: DiagnosisBench, reference: Reference) -> UnstatedBody | None:
@@ -129,7 +133,9 @@ def unstated_body(bench: DiagnosisBench, reference: Reference) -> UnstatedBody |
             turned = white @ (inverse @ products.alone.sum(axis=0).T)[tied]
             if _square(*_solved(body, off, turned)) <= least:
                 return None
-    return UnstatedBody(found, uncertain, square, least)
+    change = last_body(base) @ found
+    fall = float(change @ np.linalg.solve(inverse, change))
+    return UnstatedBody(found, uncertain, square, least, fall)
 
 
 def _solved(body: Floats, off: Floats, beside: Floats | None = None) -> tuple[Floats, Floats]:
@@ -194,7 +200,7 @@ def payload_finding(one: OtherMass | UnstatedBody) -> Finding:
         probability(grounds),
         (),
         PAYLOAD_ERROR.tell_apart,
-        one.square,
+        one.fall,
         grounds=grounds.to_dict(),
     )
 

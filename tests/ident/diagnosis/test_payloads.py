@@ -38,6 +38,7 @@ def bench(base: BaseSet, mass: float, std: float) -> Any:
     values, covariance = np.zeros(len(base)), np.zeros((len(base),) * 2)
     values[place], covariance[place, place] = mass, std**2
     evidence = SimpleNamespace(extra=["kept"], free=lambda: (values, covariance))
+    evidence.free_inverse = lambda: 1e-4 * np.eye(len(base))
     evidence.replace = lambda extra: setattr(evidence, "extra", list(extra))
     nominal = SimpleNamespace(base=base, masses=MASSES, arm=SimpleNamespace(chain=base.structure.chain))
     return SimpleNamespace(evidence=evidence, nominal=nominal)
@@ -57,6 +58,8 @@ def test_a_mass_is_held_against_the_healthy_one_or_the_announced_one(base: BaseS
     assert (one.payload, one.mass, one.expected) == ("weight", 2.6, 2.0)
     assert "2.600 ± 0.041 kg by these sessions alone, 2.000 kg expected" in one.text
     assert said.evidence.extra == ["kept"]
+    # Findings are in the order of what they take off the error of the rows.
+    assert payload_finding(one).gain == pytest.approx(0.6**2 / 1e-4)
     # The healthy arm weighed 2.6 kg under this label, too.
     assert not other_masses(said, healthy(base, 2.6, 0.02))
     (changed,) = other_masses(said, healthy(base, 2.2, 0.02))
@@ -80,7 +83,9 @@ def test_a_stated_mass_that_nothing_is_held_against_is_told(base: BaseSet) -> No
 
 
 def test_the_finding_says_the_mass_and_is_surer_for_a_clearer_one() -> None:
-    clear, faint = (payload_finding(OtherMass("weight", 2.0 + more, 2.0, 0.04, 12.0)) for more in (0.8, 0.2))
+    clear, faint = (
+        payload_finding(OtherMass("weight", 2.0 + more, 2.0, 0.04, 12.0, 1e3)) for more in (0.8, 0.2)
+    )
     assert clear.cause == "payload_error"
     assert clear.parameters["mass"].value == pytest.approx(0.8)
     assert clear.confidence > faint.confidence > 0.5
