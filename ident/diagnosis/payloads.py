@@ -28,6 +28,8 @@ _OTHER, _ONE_IN = 0.05, 1e-3
 # Largest mass, first moments and inertias of an unstated body, as standard deviations [kg, kg m, kg m^2].
 _USUAL = np.array([5.0, 1.0, 1.0, 1.0, *[0.3] * 6])
 _TOLD = 4
+# Least mass of such a body [kg], and in its standard deviations.
+_BODY, _CLEAR = 0.1, 2.0
 # Least size of a combination of a cause's columns, as a share of its largest one.
 _LEAST = 1e-6
 
@@ -124,7 +126,8 @@ def unstated_body(bench: DiagnosisBench, reference: Reference) -> UnstatedBody |
     least = _TOLD * fisher_limit(_ONE_IN, _TOLD, freedom)
     found, uncertain = _solved(body, off)
     square = _square(found, uncertain)
-    if square <= least:
+    # First moments alone are as well those of an error of sensors or positions.
+    if square <= least or abs(found[0]) < max(_BODY, _CLEAR * float(np.sqrt(uncertain[0, 0]))):
         return None
     for candidate in bench.dictionary.candidates:
         if candidate.effect is PAYLOAD_ERROR:

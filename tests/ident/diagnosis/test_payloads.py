@@ -138,6 +138,8 @@ def test_no_body_is_told_that_another_cause_or_chance_explains(base: BaseSet) ->
     arm = healthy(base, 2.0, 0.02)
     change = last_body(base) @ BODY
     assert unstated_body(carried(base, arm, 1e-3 * BODY), arm) is None
+    # First moments without a mass are of something else.
+    assert unstated_body(carried(base, arm, BODY * np.r_[0.2, np.ones(9)]), arm) is None
     assert unstated_body(carried(base, arm, BODY, (change,)), arm) is None
     other = np.zeros(len(base))
     other[0] = 1.0
