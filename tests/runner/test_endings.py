@@ -22,7 +22,8 @@ def session(motor: float | None, joint: float | None = None) -> dict[str, Any]:
     ("sessions", "told"),
     [
         ([session(0.0), session(None)], None),
-        ([session(2e-3), session(0.0, 0.0)], "motor torques 2.0 ms after the positions, ± 0.2 ms"),
+        ([session(2e-3), session(0.0, 0.0)], "motor torques 0.0 to 2.0 ms after the positions, ± 0.2 ms"),
+        ([session(0.0), session(0.0)], None),
         (
             [session(2e-3, -1e-3), session(3e-3)],
             "motor torques 2.0 to 3.0 ms after the positions, ± 0.2 ms; "
