@@ -206,8 +206,9 @@ class _Sums:
     def pays(self, joint: int, most: float) -> bool | None:
         """Whether a share of the friction turns, or all of it; None for neither."""
         whole, some = (self._held_back(joint, most, share) for share in (False, True))
-        share = self._clear(joint, some - whole)
-        return share if self._clear(joint, some if share else whole) else None
+        if self._clear(joint, whole) and not self._clear(joint, some - whole):
+            return False
+        return True if self._clear(joint, some) else None
 
     def _held_back(self, joint: int, most: float, share: bool) -> Floats:
         """Fall (b,) in each half of the blocks by the other; drawn, for a motion may go on and off in turn."""
