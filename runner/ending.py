@@ -120,8 +120,8 @@ def _delay_of(summary: Mapping[str, Any], side: str) -> str:
     if not any(delay for delay, _ in known):
         return ""
     delays, deviations = zip(*known, strict=True)
-    sign, where = (-1.0, "before") if max(delays) < 0.0 else (1.0, "after")
-    least, most = sorted((sign * min(delays), sign * max(delays)))
+    sign, where = (-1.0, "before") if max(delays) <= 0.0 else (1.0, "after")
+    least, most = sorted((sign * min(delays) + 0.0, sign * max(delays) + 0.0))
     size = f"{most:.1f}" if most - least < 0.05 else f"{least:.1f} to {most:.1f}"
     return f"{side} torques {size} ms {where} the positions, ± {max(deviations):.2g} ms"
 

@@ -25,6 +25,10 @@ def session(motor: float | None, joint: float | None = None) -> dict[str, Any]:
         ([session(2e-3), session(0.0, 0.0)], "motor torques 0.0 to 2.0 ms after the positions, ± 0.2 ms"),
         ([session(0.0), session(0.0)], None),
         (
+            [session(0.0, -1e-3), session(0.0, 0.0)],
+            "joint torques 0.0 to 1.0 ms before the positions, ± 0.1 ms",
+        ),
+        (
             [session(2e-3, -1e-3), session(3e-3)],
             "motor torques 2.0 to 3.0 ms after the positions, ± 0.2 ms; "
             "joint torques 1.0 ms before the positions, ± 0.1 ms",
