@@ -173,13 +173,13 @@ class _Sums:
         for joint in range(n):
             # As the model computes it: behind elastic joints the path of the link stands for that of the drive.
             path, speed = channel.q[:, joint], channel.qd[:, joint]
-            for place, counted in enumerate((used[:, joint], used[:, joint] & away[:, joint])):
-                own = error[:, joint] * counted
-                squared[place, :, joint] = np.add.reduceat(own**2, starts)
-                for k, length in enumerate(_LENGTHS):
-                    column = (turned_friction(path, speed, float(length)) - law[:, joint]) * counted
-                    cross[place, :, joint, k] = np.add.reduceat(column * own, starts)
-                    square[place, :, joint, k] = np.add.reduceat(column**2, starts)
+            counted = np.array([used[:, joint], used[:, joint] & away[:, joint]])
+            own = error[:, joint] * counted
+            squared[:, :, joint] = np.add.reduceat(own**2, starts, axis=1)
+            for k, length in enumerate(_LENGTHS):
+                column = (turned_friction(path, speed, float(length)) - law[:, joint]) * counted
+                cross[:, :, joint, k] = np.add.reduceat(column * own, starts, axis=1)
+                square[:, :, joint, k] = np.add.reduceat(column**2, starts, axis=1)
         torque = np.where(used, channel.torque, 0.0)
         return cls(cross, square, squared, np.add.reduceat(torque**2, starts))
 

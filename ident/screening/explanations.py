@@ -95,7 +95,9 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
     before, tried = fit.score, []
 
     def scored(candidate: Explanation) -> tuple[Explanation, Fit]:
-        after = candidate.mended.fit(normal, doubtful=False)
+        # Torques are mapped; other changes make other rows.
+        mapped = candidate.channel.endswith("torque")
+        after = candidate.mended.fit(normal if mapped else None, doubtful=False)
         return replace(candidate, drop=before - after.score), after
 
     for candidate in _torques(data, data.gains(fit, normal)):
@@ -104,13 +106,8 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
         if believed(one, len(normal.classes)) and max(after.rho.values()) < AGREES:
             break
     else:
-        for candidate in _motions(data):
-            drop = before - candidate.mended.fit(doubtful=False).score
-            tried.append(replace(candidate, drop=drop))
-    for candidate in _of_parts(data, fit, normal):
-        moved_rows = candidate.channel == "position"
-        drop = before - candidate.mended.fit(None if moved_rows else normal, doubtful=False).score
-        tried.append(replace(candidate, drop=drop))
+        tried += [scored(candidate)[0] for candidate in _motions(data)]
+    tried += [scored(candidate)[0] for candidate in _of_parts(data, fit, normal)]
     tried = [one for one in tried if believed(one, len(normal.classes))]
     # Of the session as a whole before its half.
     best = max(tried, key=lambda one: one.drop - _FINER * (len(one.parts) == 1), default=None)

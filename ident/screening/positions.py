@@ -21,6 +21,9 @@ from ident.screening.redundancy import Fit, Normal, Part, Redundancy, SampledRow
 _DEVIATIONS = 6.0
 _STEP = 1e-3
 
+_Asked = tuple[int, str, tuple[Part, ...]]
+"""Joint, kind and parts of an error, none for all."""
+
 
 class _Kind(NamedTuple):
     """A kind of error: least size of interest, least fall of the score with it undone, and the size in words.
@@ -70,31 +73,43 @@ class PositionError:
 def position_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PositionError]:
     """The error that explains most, if there is one that explains enough, and more than a base that leans."""
     # In motor torques alone, friction that follows no simple law looks like late positions.
-    asked = [
+    asked: list[_Asked] = [
         (joint, kind, ())
         for joint in range(data.chain.n)
         for kind in KINDS
         if ("joint" in data.sides or kind != "delay")
         and not (data.chain.prismatic[joint] and kind == "offset")
     ]
-    found = [*_errors(data, fit, normal, asked), *session_offsets(data, fit, normal)]
+    found = _errors(data, fit, normal, [*asked, *_by_session(data, normal)])
     best = max(found, key=lambda one: one.drop, default=None)
     return [] if best is None or best.drop <= _leaning(data, fit, normal) else [best]
 
 
 def session_offsets(data: Redundancy, fit: Fit, normal: Normal) -> list[PositionError]:
     """Zeros of positions that differ in one of several sessions."""
+    return list(_errors(data, fit, normal, _by_session(data, normal)))
+
+
+def _by_session(data: Redundancy, normal: Normal) -> list[_Asked]:
     sessions = sessions_of(normal.parts)
     turning = [joint for joint in range(data.chain.n) if not data.chain.prismatic[joint]]
-    asked = [(joint, "offset", parts) for parts in sessions for joint in turning]
-    return list(_errors(data, fit, normal, asked)) if len(sessions) > 1 else []
+    return [(joint, "offset", parts) for parts in sessions for joint in turning] if len(sessions) > 1 else []
 
 
-def _errors(
-    data: Redundancy, fit: Fit, normal: Normal, asked: Sequence[tuple[int, str, tuple[Part, ...]]]
-) -> Iterator[PositionError]:
-    """Errors beyond chance and the least of interest: joint, kind and parts (none: all) of each."""
-    sizes = data.along(fit, normal, (_added(data, fit, *one) for one in asked))
+def _errors(data: Redundancy, fit: Fit, normal: Normal, asked: Sequence[_Asked]) -> Iterator[PositionError]:
+    """Errors beyond chance and the least of interest."""
+    torques = [data.rigid(rows, fit) for rows in data.rows]
+
+    def added(joint: int, kind: str, parts: tuple[Part, ...]) -> list[Floats]:
+        """Torques (n, K) that an error by one adds to those of the bodies, for all sets of rows."""
+        return [
+            (data.rigid(after, fit) - torque) / _STEP if after is not before else np.zeros_like(torque)
+            for before, after, torque in zip(
+                data.rows, _changed(data, joint, kind, _STEP, parts).rows, torques, strict=True
+            )
+        ]
+
+    sizes = data.along(fit, normal, (added(*one) for one in asked))
     for (joint, kind, parts), (size, std, _) in zip(asked, sizes, strict=True):
         # Beyond one the column says nothing.
         if not max(KINDS[kind].least, _DEVIATIONS * std) < abs(size) < 1.0:
@@ -104,16 +119,6 @@ def _errors(
         if drop > KINDS[kind].drop:
             recorded = {"offset": -size, "gain": 1.0 / (1.0 + size) - 1.0}.get(kind, size)
             yield PositionError(joint, kind, recorded, std, drop, mended, parts)
-
-
-def _added(data: Redundancy, fit: Fit, joint: int, kind: str, parts: tuple[Part, ...]) -> list[Floats]:
-    """Torques (n, K) that an error by one adds to those of the bodies, for all sets of rows."""
-    return [
-        (data.rigid(after, fit) - data.rigid(before, fit)) / _STEP
-        if after is not before
-        else np.zeros_like(before.q.T)
-        for before, after in zip(data.rows, _changed(data, joint, kind, _STEP, parts).rows, strict=True)
-    ]
 
 
 def _changed(data: Redundancy, joint: int, kind: str, size: float, parts: tuple[Part, ...]) -> Redundancy:

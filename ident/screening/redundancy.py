@@ -535,16 +535,14 @@ def _moving(rows: Sequence[SampledRows]) -> list[SampledRows]:
 
 def _timed(rows: Sequence[SampledRows]) -> list[SampledRows]:
     """The rows with their times from 0 to 1 of the session."""
-    times: dict[tuple[str, int], list[Floats]] = {}
+    ends: dict[tuple[str, int], tuple[float, float]] = {}
     for one in rows:
-        times.setdefault((one.side, one.record), []).append(one.time)
-    whole = {key: np.concatenate(parts) for key, parts in times.items()}
-    start = {key: float(np.min(values)) for key, values in whole.items()}
-    length = {key: float(np.ptp(values)) or 1.0 for key, values in whole.items()}
-    places = [(one.side, one.record) for one in rows]
+        low, high = ends.get((one.side, one.record), (np.inf, -np.inf))
+        ends[one.side, one.record] = min(low, float(one.time.min())), max(high, float(one.time.max()))
     return [
-        replace(one, time=(one.time - start[key]) / length[key])
-        for one, key in zip(rows, places, strict=True)
+        replace(one, time=(one.time - low) / ((high - low) or 1.0))
+        for one in rows
+        for low, high in (ends[one.side, one.record],)
     ]
 
 

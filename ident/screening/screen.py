@@ -274,10 +274,8 @@ def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
         certain = strange and one.gain.left < _LEFT
         mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
     elif one.parts and channel == "position":
-        session, seen = (
-            sessions[one.parts[0][0]].path.name,
-            f"contradicts the torques and the other sessions; {better}",
-        )
+        session = sessions[one.parts[0][0]].path.name
+        seen = f"contradicts the torques and the other sessions; {better}"
         mend = _MEND_POSITION
     elif one.parts:
         session, seen, certain = _of_part(one, sessions)
