@@ -289,6 +289,8 @@ class Loop:
             and remote.quality >= Quality.OK
             and remote.restarts == self._restarts
             and remote.foreseen is not None
+            # A packet sent twice must not outlive the packets after it: it would look like a restart.
+            and not remote.pending()
         )
         if ring is not None:
             most = min(most, ring.free, ring.capacity // _RING_SHARE)

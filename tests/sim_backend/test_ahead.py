@@ -299,3 +299,28 @@ def test_nothing_is_offered_without_a_motion(monkeypatch: pytest.MonkeyPatch) ->
         assert not len(pair.loop.offer(10))
     finally:
         pair.close()
+
+
+def test_a_packet_sent_twice_during_a_pause_is_no_restart(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = Pair(monkeypatch, 250, {"fri.program": OWN, "controller.settle_s": 0.05}, 0.0)
+    try:
+        pair.until(lambda: pair.cabinet.session.state is State.MON)
+        assert pair.job(Job.START) is Result.DONE
+        assert pair.job(Job.CYCLES, 10) is Result.DONE
+        # As after a reminder of a loop that waits for its driver.
+        send, sent = pair.service.end.send, list[bytes]()
+
+        def thrice(datagram: bytes) -> None:
+            for _ in range(1 if sent else 3):
+                send(datagram)
+            sent.append(datagram)
+
+        monkeypatch.setattr(pair.service.end, "send", thrice)
+        assert pair.move(AWAY) is Result.DONE
+        assert pair.blocks > 0
+        # A copy left over would be taken late, by the next cycle that goes by itself.
+        assert pair.job(Job.CYCLES, 10) is Result.DONE
+        remote = pair.loop.remote
+        assert (remote.repeated, remote.reordered, remote.restarts, remote.lost) == (2, 0, 0, 0)
+    finally:
+        pair.close()
