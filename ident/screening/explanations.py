@@ -8,7 +8,7 @@ one is taken, and the search goes on in the mended data, because two channels ma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,6 +38,8 @@ _PACES = (0.25, 0.5, 2.0 / 3.0, 0.8, 1.25, 1.5, 2.0, 4.0)
 # Fall of the score for which a plain factor is given up.
 _FINER = 0.1
 _OFFSETS = (-np.pi, -0.5 * np.pi, 0.5 * np.pi)
+# Candidates that are fitted to the end, rounds in which all are compared, and for motions the rows for each parameter.
+_LIKELY, _SOON, _ENOUGH = 8, 3, 6.0
 
 
 @dataclass(frozen=True)
@@ -100,17 +102,20 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
         after = candidate.mended.fit(normal if mapped else None, doubtful=False)
         return replace(candidate, drop=before - after.score), after
 
-    for candidate in _torques(data, data.gains(fit, normal)):
+    for candidate in _likely(_torques(data, data.gains(fit, normal)), normal):
         one, after = scored(candidate)
         tried.append(one)
         if believed(one, len(normal.classes)) and max(after.rho.values()) < AGREES:
             break
     else:
-        tried += [scored(candidate)[0] for candidate in _motions(data)]
-    tried += [scored(candidate)[0] for candidate in _of_parts(data, fit, normal)]
+        # Each asks for regressors of its own: of few rows first.
+        few = data.thinned(_ENOUGH)
+        tried += [scored(candidate)[0] for candidate in _likely(_motions(data), tries=_motions(few))]
+    tried += [scored(candidate)[0] for candidate in _likely(_of_parts(data, fit, normal), normal)]
     tried = [one for one in tried if believed(one, len(normal.classes))]
-    # Of the session as a whole before its half.
-    best = max(tried, key=lambda one: one.drop - _FINER * (len(one.parts) == 1), default=None)
+    # Of the session as a whole before its half; of equals the later one, for what breaks was whole before.
+    ranked = {k: round(one.drop - _FINER * (len(one.parts) == 1), 2) for k, one in enumerate(tried)}
+    best = tried[max(ranked, key=lambda k: (ranked[k], k))] if tried else None
     return None if best is None else _refined(best, before, normal)
 
 
@@ -170,6 +175,26 @@ def _scaled_part(
     return Explanation(
         f"{key[0]} torque", (key[1],), unit_of(factor), mended, factor=factor, error=error, parts=parts
     )
+
+
+def _likely(
+    candidates: Iterable[Explanation],
+    normal: Normal | None = None,
+    tries: Iterable[Explanation] | None = None,
+) -> list[Explanation]:
+    """Those with a measured size, and of the others the ones that soon leave the least residuals.
+
+    normal : of torques, as for `Redundancy.fit`. tries : the candidates in other rows, to be tried in their place.
+    """
+    candidates = list(candidates)
+    tries = candidates if tries is None else list(tries)
+    left = {
+        number: tries[number].mended.fit(normal, doubtful=False, rounds=_SOON).score
+        for number, one in enumerate(candidates)
+        if one.gain is one.error is None
+    }
+    least = sorted(left, key=lambda number: left[number])[:_LIKELY]
+    return [one for number, one in enumerate(candidates) if number in least or number not in left]
 
 
 def _motions(data: Redundancy) -> Iterator[Explanation]:

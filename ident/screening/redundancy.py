@@ -44,7 +44,8 @@ _BODY = len(INERTIAL)
 _JOINT, _MOTOR = 3, 4
 # A residual below this share of the torque is as good as none: the accuracy of torque sensors.
 FLOOR = 0.01
-_ROUNDS = 8
+# Rounds of reweighting, and fall of the score in one that ends them.
+_ROUNDS, _SETTLED = 8, 1e-3
 # Square of the sine between a column and those before it, below which it is dependent.
 _DEPENDENT = 1e-9
 # Norm of a column over the largest, below which it is nothing but rounding.
@@ -327,20 +328,26 @@ class Redundancy:
         mixed = np.zeros((len(place), len(parts), width, n + 2))
         scatter, square = np.zeros((2, len(place), len(parts), n + 2, n + 2))
         means = self._means()
-        for rows in self.rows:
-            torque, o = _extended(rows), parts.index(rows.part)
-            mean = means[rows.side, rows.record]
-            for j, (own, moving) in enumerate(zip(self.matrix(rows), rows.moving.T, strict=True)):
-                if (k := place.get((rows.side, j))) is None:
-                    continue
+        for side in self.sides:
+            rows = sorted((one for one in self.rows if one.side == side), key=lambda one: one.part)
+            joints = [j for j in range(n) if (side, j) in place]
+            at = [place[side, j] for j in joints]
+            regressor = np.concatenate([self.matrix(one) for one in rows], axis=1)[joints]
+            moving = np.concatenate([one.moving for one in rows]).T[joints, :, None]
+            seen = np.concatenate([_extended(one) for one in rows]) * moving
+            for k, own, weight in zip(at, regressor, moving, strict=True):
                 # A joint's torque has the bodies behind it and its own drive alone.
                 used = np.flatnonzero(own.any(axis=0))
-                part, seen = own[np.ix_(moving, used)], torque[moving]
-                matrix[k][np.ix_(used, used)] += part.T @ part
-                mixed[k, o, used] += part.T @ seen
-                centred = seen - mean[j]
-                scatter[k, o] += centred.T @ centred
-                square[k, o] += seen.T @ seen
+                part = own[:, used] * weight
+                matrix[k][np.ix_(used, used)] = part.T @ part
+            begin = 0
+            for one in rows:
+                rest = slice(begin, begin := begin + len(one.q))
+                o, some = parts.index(one.part), seen[:, rest]
+                centred = some - means[side, one.record][joints, None] * moving[:, rest]
+                mixed[at, o] += _transposed(regressor[:, rest]) @ some
+                scatter[at, o] += _transposed(centred) @ centred
+                square[at, o] += _transposed(some) @ some
         return Normal(tuple(place), parts, matrix, mixed, scatter, square)
 
     def _means(self) -> dict[tuple[str, int], Floats]:
@@ -354,8 +361,16 @@ class Redundancy:
 
     def enough(self, share: float) -> bool:
         """Whether there are `share` rows for each parameter."""
-        count = sum(int(rows.moving.sum()) for rows in self.rows) - len(self.silent)
-        return count >= share * self.width
+        return self._count >= share * self.width
+
+    @property
+    def _count(self) -> int:
+        return sum(int(rows.moving.sum()) for rows in self.rows) - len(self.silent)
+
+    def thinned(self, share: float) -> Redundancy:
+        """As few of the rows as give about `share` for each parameter; all where they are no more."""
+        step = max(1, int(self._count / (share * self.width)))
+        return replace(self, rows=tuple(rows.thinned(step) for rows in self.rows))
 
     def map_of(self, side: str, part: Part | None = None) -> Floats:
         """(n + 2, n + 2), [true torque, 1, time] = map @ the same as measured; of a side, or of a part's."""
@@ -382,10 +397,11 @@ class Redundancy:
         """Torque (K, n) with the changes of the channel undone."""
         return np.asarray(_extended(rows) @ self.map_of(rows.side, rows.part)[: self.chain.n].T)
 
-    def fit(self, normal: Normal | None = None, *, doubtful: bool = True) -> Fit:
+    def fit(self, normal: Normal | None = None, *, doubtful: bool = True, rounds: int = _ROUNDS) -> Fit:
         """Weighted least squares, each class weighted by its own residual.
 
-        normal : of rows with different `maps` only. doubtful : whether a torque may be in a wrong unit.
+        normal : of rows with different `maps` only. doubtful : whether a torque may be in a wrong unit. rounds : of
+        reweighting, at most.
         """
         normal = self.normal() if normal is None else normal
         maps = [[self.map_of(side, part)[joint] for part in normal.parts] for side, joint in normal.classes]
@@ -402,12 +418,16 @@ class Redundancy:
         fits = []
         # A torque in a wrong unit is far too heavy or far too light in one of these starts.
         for start in (total, common)[: 1 + doubtful]:
-            weight, error, values = 1.0 / start, total, np.zeros(0)
-            for _ in range(_ROUNDS):
+            weight, error, values, score = 1.0 / start, total, np.zeros(0), np.inf
+            for _ in range(rounds):
                 values = solve((weight @ flat.reshape(count, -1)).reshape(width, width), weight @ mixed)
                 fitted = (flat @ values).reshape(count, width) @ values
                 error = np.maximum(square - 2.0 * mixed @ values + fitted, 0.0)
                 weight = 1.0 / np.maximum(error, least)
+                # The score falls from round to round.
+                before, score = score, float(0.5 * np.sum(np.log(np.maximum(error, least) / total)))
+                if before - score < _SETTLED:
+                    break
             rho = np.sqrt(error / total)
             fits.append(
                 Fit(
@@ -549,6 +569,11 @@ def _timed(rows: Sequence[SampledRows]) -> list[SampledRows]:
 def _extended(rows: SampledRows) -> Floats:
     """The measured torques (K, n + 2), a one and the time."""
     return np.column_stack([rows.torque, np.ones(len(rows.torque)), rows.time])
+
+
+def _transposed(matrices: Floats) -> Floats:
+    """Each of the matrices (k, a, b) transposed."""
+    return matrices.transpose(0, 2, 1)
 
 
 def _only(values: Floats, joint: int | None) -> Floats:
