@@ -36,7 +36,7 @@ from ident.rows.prepared import PreparedSession
 from ident.rows.sessions import payload_name, require
 from ident.rows.shared_rows import marks
 from ident.rows.signal_choice import choose_signals
-from ident.screening.doubts import Doubt, doubted_joints, settle
+from ident.screening.doubts import Doubt, doubted_joints, explaining, settle
 from ident.screening.screen import require_sound
 from lwr_driver.listing import Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
@@ -447,47 +447,50 @@ def observed(
             chosen, chain, settings.signals, settings.couplings, motor=needs_motor, recall=recall
         )
         known = Known(found)
-    mounted = payloads if settings.model != 3 else [None] * len(payloads)
-    base = numeric_base(structure, _conditions(structure, chosen, mounted))
-    laws = (settings.coulomb, settings.row_coulomb)
-    signals = choose_signals(chosen, mounted, structure, base.columns, settings.signals, laws, recall=recall)
-    known = replace(known, signal_reasons=known.signal_reasons or signals.reasons)
-    rows_structure = replace(structure, coulomb=signals.row_coulomb)
-    structure = replace(structure, coulomb=signals.coulomb)
-    base = replace(base, structure=structure)
-    settings = replace(
-        settings, signals=signals.settings, coulomb=signals.coulomb, row_coulomb=signals.row_coulomb
-    )
-    make = partial(
-        session_rows,
-        structure=rows_structure,
-        base=base,
-        resonance_hz=settings.resonance_hz,
-        motor=needs_motor,
-        advise=not known.signal_reasons,
-        recall=recall,
-    )
-    # One session after the other, so that memory holds the full-rate signals of one only.
-    pairs = list(zip(chosen, mounted, strict=True))
-    made = [make(session, payload, signals=settings.signals) for session, payload in pairs]
-    made = apart_in_time(with_delays(made, pairs, settings.signals, make))
-    for warning in (text for one in made for text in one.prepared.warnings) if first else ():
-        logger.warning("%s", warning)
-    prepared, problems = [one.prepared for one in made], [one.problem for one in made]
-    instruments = [one.instruments for one in made if one.instruments is not None]
-    _every_joint_moves(prepared, chain)
-    return Observed(
-        settings=settings,
-        structure=structure,
-        base=base,
-        problem=stack(problems),
-        instruments=tuple(instruments) if len(instruments) == len(problems) else (),
-        prepared=tuple(prepared),
-        payloads=tuple(payloads),
-        sessions=tuple(chosen),
-        known=known,
-        recall=recall,
-    )
+    with explaining(known.doubts):
+        mounted = payloads if settings.model != 3 else [None] * len(payloads)
+        base = numeric_base(structure, _conditions(structure, chosen, mounted))
+        laws = (settings.coulomb, settings.row_coulomb)
+        signals = choose_signals(
+            chosen, mounted, structure, base.columns, settings.signals, laws, recall=recall
+        )
+        known = replace(known, signal_reasons=known.signal_reasons or signals.reasons)
+        rows_structure = replace(structure, coulomb=signals.row_coulomb)
+        structure = replace(structure, coulomb=signals.coulomb)
+        base = replace(base, structure=structure)
+        settings = replace(
+            settings, signals=signals.settings, coulomb=signals.coulomb, row_coulomb=signals.row_coulomb
+        )
+        make = partial(
+            session_rows,
+            structure=rows_structure,
+            base=base,
+            resonance_hz=settings.resonance_hz,
+            motor=needs_motor,
+            advise=not known.signal_reasons,
+            recall=recall,
+        )
+        # One session after the other, so that memory holds the full-rate signals of one only.
+        pairs = list(zip(chosen, mounted, strict=True))
+        made = [make(session, payload, signals=settings.signals) for session, payload in pairs]
+        made = apart_in_time(with_delays(made, pairs, settings.signals, make))
+        for warning in (text for one in made for text in one.prepared.warnings) if first else ():
+            logger.warning("%s", warning)
+        prepared, problems = [one.prepared for one in made], [one.problem for one in made]
+        instruments = [one.instruments for one in made if one.instruments is not None]
+        _every_joint_moves(prepared, chain)
+        return Observed(
+            settings=settings,
+            structure=structure,
+            base=base,
+            problem=stack(problems),
+            instruments=tuple(instruments) if len(instruments) == len(problems) else (),
+            prepared=tuple(prepared),
+            payloads=tuple(payloads),
+            sessions=tuple(chosen),
+            known=known,
+            recall=recall,
+        )
 
 
 def estimator_factory(name: str, *, prior_std: float = 0.2, **options: Any) -> EstimatorFactory:

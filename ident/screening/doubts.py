@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from fri.errors import DataError
@@ -54,3 +55,15 @@ def settle(doubts: Sequence[Doubt]) -> list[str]:
     if certain:
         raise DataError("\n".join([*certain, *(text for text in sentences if text not in certain)]))
     return sentences
+
+
+@contextlib.contextmanager
+def explaining(doubts: Sequence[Doubt]) -> Iterator[None]:
+    """Adds the doubts to a DataError from within: what they name may be its cause."""
+    try:
+        yield
+    except DataError as error:
+        if not doubts:
+            raise
+        seen = ("before that these channels were in doubt:", *settle(doubts))
+        raise DataError("\n".join([str(error), *seen])) from error

@@ -30,7 +30,7 @@ from ident.dynamics.kinematics import Chain
 from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
 from ident.screening.channels import check_channels
-from ident.screening.doubts import Doubt, settle
+from ident.screening.doubts import Doubt, explaining, settle
 from ident.screening.explanations import unit_of
 from ident.screening.positions import position_errors
 from ident.screening.screen import _in_bands, require_sound, screen, without_dead
@@ -631,3 +631,12 @@ def test_motor_torques_that_are_a_copy_of_the_joint_torques_are_named(pair: list
     effort[:, 1:] += 0.01
     (found,) = screen([replace(copied, motor=replace(joint, effort=effort))], chain())
     assert found.joints == chain().joint_names[:1]
+
+
+def test_an_error_after_a_doubt_says_the_doubt() -> None:
+    clipped_torque = Doubt("motor torque", ("A1",), "stays at 24.9 Nm", "saturation", "move more gently")
+    with pytest.raises(DataError, match=r"no delay fits\n.*in doubt:\nA1 motor torque: stays at 24.9 Nm"):
+        with explaining((clipped_torque,)):
+            raise DataError("no delay fits")
+    with pytest.raises(DataError, match=r"^no delay fits$"), explaining(()):
+        raise DataError("no delay fits")
