@@ -635,8 +635,8 @@ def test_motor_torques_that_are_a_copy_of_the_joint_torques_are_named(pair: list
 
 def test_an_error_after_a_doubt_says_the_doubt() -> None:
     clipped_torque = Doubt("motor torque", ("A1",), "stays at 24.9 Nm", "saturation", "move more gently")
-    with pytest.raises(DataError, match=r"no delay fits\n.*in doubt:\nA1 motor torque: stays at 24.9 Nm"):
-        with explaining((clipped_torque,)):
-            raise DataError("no delay fits")
+    said = r"no delay fits\n.*in doubt:\nA1 motor torque: stays at 24.9 Nm"
+    with pytest.raises(DataError, match=said), explaining((clipped_torque,)):
+        raise DataError("no delay fits")
     with pytest.raises(DataError, match=r"^no delay fits$"), explaining(()):
         raise DataError("no delay fits")
