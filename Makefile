@@ -8,7 +8,7 @@ TEST_READY := $(VENV)/.test-ready
 unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 
-.PHONY: help setup experiment test test-long quick hooks lint browser docs pictures screenshot clean
+.PHONY: help setup experiment test test-long quick hooks lint browser compiled docs pictures screenshot clean
 
 help:
 	@echo "make experiment   set up and run the whole experiment against the built-in emulator"
@@ -51,7 +51,12 @@ lint: $(TEST_READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint browser
+# What the tests would compile in several processes at once.
+compiled: $(READY)
+	$(BIN)/python -m runner.compiled
+
+test: $(TEST_READY)
+	@$(MAKE) --no-print-directory -j 3 lint browser compiled
 	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder -m "not long"
 
 quick: $(TEST_READY)
