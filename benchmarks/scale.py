@@ -1,14 +1,17 @@
-"""CPU time and peak memory of the commands by length of their sessions, at 1 kHz with two payloads.
+"""CPU time and peak memory of the commands by length and number of their sessions, at 1 kHz with two payloads.
 
-Run `python -m benchmarks.scale LOGS [--minutes 1 10 60] [--commands identify validate ...]`. LOGS is the folder of an
-experiment with the emulator; the periods of its `unloaded.mcap` and `loaded.mcap` are repeated to the wanted length,
-with fresh noise of the sensors. `--recorded` diagnoses its sessions as they are, too. Peak memory is the kernel's
-figure for the command's process (`wait4`).
+Run `python -m benchmarks.scale LOGS [--minutes 1 10 30] [--sessions 20 200] [--commands identify validate ...]`. LOGS
+is the folder of an experiment with the emulator; the periods of its `unloaded.mcap` and `loaded.mcap` are repeated to
+the wanted length, with fresh noise of the sensors: two sessions of so many minutes, then so many sessions of half a
+minute. `import` reads a CSV file of the first session. `--recorded` diagnoses the experiment's sessions as they are,
+too. Peak memory is the kernel's figure for the command's process (`wait4`), the exponent that of the CPU time over the
+samples, from the row before. All files stay in `--folder`.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import time
@@ -17,11 +20,25 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import pyarrow
+from pyarrow.csv import write_csv
 
+from lwr_driver.configuration import find
 from lwr_driver.session import Session, SessionWriter, read_session
 
 POSITION_NOISE_RAD, TORQUE_NOISE_NM = 2e-6, 0.02
 NAMES = ("unloaded", "loaded")
+COMMANDS = ("identify", "validate", "report", "diagnose", "import")
+SHORT_MIN = 0.5
+MAPPING = f"""\
+robot: emulated LWR4+
+urdf: {find("lwr4plus.urdf")}
+joints: [A1, A2, E1, A3, A4, A5, A6]
+time: {{column: time}}
+position: {{columns: [q1, q2, q3, q4, q5, q6, q7]}}
+velocity: {{columns: [dq1, dq2, dq3, dq4, dq5, dq6, dq7]}}
+joint_torque: {{columns: [tau1, tau2, tau3, tau4, tau5, tau6, tau7]}}
+"""
 _TILED = ("log_time", "publish_time", "sequence")
 
 
@@ -75,15 +92,31 @@ def tile(source: Session, path: Path, seconds: float, seed: int) -> None:
             writer.advance(first + shift + length - 10**9)
 
 
+def as_csv(session: Path, path: Path) -> None:
+    """The joint channel of a session as a text file: times and, of each joint, position, velocity and torque."""
+    joint = read_session(session).joint
+    quantities = {"q": joint.position, "dq": joint.velocity, "tau": joint.effort}
+    columns = {"time": (joint.log_time - joint.log_time[0]) * 1e-9}
+    for name, values in quantities.items():
+        columns |= {f"{name}{number + 1}": values[:, number] for number in range(values.shape[1])}
+    write_csv(pyarrow.table(columns), path)
+
+
 def command_of(name: str, folder: Path) -> list[str]:
     """Arguments of `lwr-run` for one command on the sessions of a folder."""
-    logs = [str(folder / f"{session}.mcap") for session in NAMES]
+    logs = [str(path) for path in sorted(folder.glob("session-*.mcap"))]
     model = str(folder / "model.yaml")
+    if name == "import":
+        table = folder / "recording.csv"
+        if not table.exists():
+            as_csv(Path(logs[0]), table)
+        (folder / "mapping.yaml").write_text(MAPPING)
+        return ["import", str(folder / "mapping.yaml"), str(table), str(folder / "imported.mcap"), "--force"]
     return {
-        "identify": ["identify", *logs, "--out", model],
+        "identify": ["identify", *logs, "--out", model, "--force"],
         "validate": ["validate", model, *logs, "--allow-seen"],
         "diagnose": ["diagnose", *logs, "--out", str(folder / f"diagnosis-{time.time_ns()}")],
-        "results": ["identify", *logs, "--results", str(folder / f"results-{time.time_ns()}")],
+        "report": ["identify", *logs, "--results", str(folder / f"results-{time.time_ns()}")],
     }[name]
 
 
@@ -112,11 +145,23 @@ def measure(arguments: Sequence[str], log: Path) -> tuple[int, float, float, flo
     return os.waitstatus_to_exitcode(status), time.monotonic() - start, cpu, used.ru_maxrss / 1024
 
 
+def prepared(logs: Path, folder: Path, sessions: int, minutes: float) -> Path:
+    """The folder with so many sessions of so many minutes, with and without payload in turn."""
+    place = folder / f"{sessions}x{minutes:g}min"
+    place.mkdir(parents=True, exist_ok=True)
+    for number in range(sessions):
+        path = place / f"session-{number:03d}.mcap"
+        if not path.exists():
+            tile(read_session(logs / f"{NAMES[number % 2]}.mcap"), path, 60.0 * minutes, number)
+    return place
+
+
 def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("logs", type=Path, help="folder of an experiment with the emulator")
-    parser.add_argument("--minutes", type=float, nargs="+", default=[1.0, 10.0, 60.0])
-    parser.add_argument("--commands", nargs="+", default=["identify", "validate", "diagnose"])
+    parser.add_argument("--minutes", type=float, nargs="*", default=[1.0, 10.0, 30.0])
+    parser.add_argument("--sessions", type=int, nargs="*", default=[20, 200])
+    parser.add_argument("--commands", nargs="+", default=list(COMMANDS), choices=COMMANDS)
     parser.add_argument("--folder", type=Path, default=Path("scale"), help="for the tiled sessions; kept")
     parser.add_argument(
         "--recorded", action="store_true", help="diagnose the experiment's own sessions first"
@@ -128,20 +173,23 @@ def main(arguments: Sequence[str]) -> int:
         print(
             f"diagnose   as recorded: CPU {cpu:6.1f} s, wall {wall:6.1f} s, peak {peak:6.0f} MB, exit {code}"
         )
-    for minutes in chosen.minutes:
-        folder = chosen.folder / f"{minutes:g}min"
-        folder.mkdir(parents=True, exist_ok=True)
-        for seed, name in enumerate(NAMES):
-            path = folder / f"{name}.mcap"
-            if not path.exists():
-                tile(read_session(chosen.logs / f"{name}.mcap"), path, 60.0 * minutes, seed)
-        for command in chosen.commands:
-            code, wall, cpu, peak = measure(command_of(command, folder), folder / f"{command}.txt")
+    sets = [(2, minutes) for minutes in chosen.minutes] + [(number, SHORT_MIN) for number in chosen.sessions]
+    for command in chosen.commands:
+        before: tuple[float, float] | None = None
+        for sessions, minutes in sets if command != "import" else [one for one in sets if one[0] == 2]:
+            folder = prepared(chosen.logs, chosen.folder, sessions, minutes)
+            words = command_of(command, folder)
+            code, wall, cpu, peak = measure(words, folder / f"{command}.txt")
+            size = sessions * minutes
+            exponent = (
+                "" if before is None else f"{math.log(cpu / before[1]) / math.log(size / before[0]):5.2f}"
+            )
             print(
-                f"{command:10} 2 x {minutes:g} min: CPU {cpu:6.1f} s, wall {wall:6.1f} s, "
-                f"peak {peak:6.0f} MB, exit {code}",
+                f"{command:9} {sessions:4} x {minutes:4g} min: CPU {cpu:6.1f} s, wall {wall:6.1f} s, "
+                f"peak {peak:6.0f} MB, exponent {exponent:>5}, exit {code}",
                 flush=True,
             )
+            before = size, cpu
     return 0
 
 

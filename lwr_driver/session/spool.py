@@ -2,7 +2,7 @@
 
 The positions of an hour at 1 kHz have 200 MB. Their pages come into memory where they are read; `release` gives them
 back, and so does a thread beyond 64 MB in all. Files have no name, so the system removes them with the last array, or
-with the process.
+with the process. Shorter arrays stay in memory while they are few: a hundred short sessions are as long as one hour.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEAST_BYTES = 4 * 2**20
-"""Smaller arrays stay in memory."""
+"""Smaller arrays stay in memory, up to `_MOST_BYTES` of them."""
 _SMALL_BYTES = 2**16
 _ARENA_BYTES = 2**22, 2**28
 """First and largest file of an arena; each has twice the size of the one before."""
@@ -63,7 +63,7 @@ class Growing:
     def array(self) -> NDArray[Any]:
         """All rows; none may follow."""
         if self._file is None:
-            return self._parts[0] if len(self._parts) == 1 else np.concatenate(self._parts)
+            return _in_memory(self._parts[0] if len(self._parts) == 1 else np.concatenate(self._parts))
         self._flush()
         self._file.flush()
         last = self._parts[-1]
@@ -112,6 +112,32 @@ class Arena:
             self._used += -(-array.nbytes // 64) * 64
         kept[...] = array
         return kept
+
+
+class _Few:
+    """Arrays in memory while they are few, and an arena for the others."""
+
+    def __init__(self) -> None:
+        self._bytes, self._lock, self._arena = 0, threading.Lock(), Arena()
+
+    def keep(self, array: NDArray[Any]) -> NDArray[Any]:
+        """The same array, in a file if those in memory are many; what is in a file already stays there."""
+        if array.nbytes < _SMALL_BYTES or mapping(array) is not None:
+            return array
+        with self._lock:
+            few = self._bytes + array.nbytes <= _MOST_BYTES
+            self._bytes += array.nbytes if few else 0
+        if not few:
+            return self._arena.keep(array)
+        weakref.finalize(array, self._forget, array.nbytes)
+        return array
+
+    def _forget(self, count: int) -> None:
+        with self._lock:
+            self._bytes -= count
+
+
+_in_memory = _Few().keep
 
 
 def shelved(groups: Iterable[Sequence[NDArray[Any]]]) -> list[list[NDArray[Any]]]:
