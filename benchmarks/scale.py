@@ -1,6 +1,6 @@
 """CPU time and peak memory of the commands by length and number of their sessions, at 1 kHz with two payloads.
 
-Run `python -m benchmarks.scale LOGS [--minutes 1 10 30] [--sessions 20 200] [--commands identify validate ...]`. LOGS
+Run `python -m benchmarks.scale LOGS [--minutes 1 10 30] [--sessions 20] [--commands identify validate ...]`. LOGS
 is the folder of an experiment with the emulator; the periods of its `unloaded.mcap` and `loaded.mcap` are repeated to
 the wanted length, with fresh noise of the sensors: two sessions of so many minutes, then so many sessions of half a
 minute. `import` reads a CSV file of the first session. `--recorded` diagnoses the experiment's sessions as they are,
@@ -15,8 +15,10 @@ import math
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +26,7 @@ import pyarrow
 from pyarrow.csv import write_csv
 
 from lwr_driver.configuration import find
-from lwr_driver.session import Session, SessionWriter, read_session
+from lwr_driver.session import SessionWriter, read_session
 
 POSITION_NOISE_RAD, TORQUE_NOISE_NM = 2e-6, 0.02
 NAMES = ("unloaded", "loaded")
@@ -35,15 +37,15 @@ robot: emulated LWR4+
 urdf: {find("lwr4plus.urdf")}
 joints: [A1, A2, E1, A3, A4, A5, A6]
 time: {{column: time}}
-position: {{columns: [q1, q2, q3, q4, q5, q6, q7]}}
-velocity: {{columns: [dq1, dq2, dq3, dq4, dq5, dq6, dq7]}}
-joint_torque: {{columns: [tau1, tau2, tau3, tau4, tau5, tau6, tau7]}}
+position: {{columns: [q1, q2, q3, q4, q5, q6, q7], unit: rad}}
+joint_torque: {{columns: [tau1, tau2, tau3, tau4, tau5, tau6, tau7], unit: Nm}}
 """
 _TILED = ("log_time", "publish_time", "sequence")
 
 
-def tile(source: Session, path: Path, seconds: float, seed: int) -> None:
-    """Write the periods of `source` again and again, with fresh noise, one after the other."""
+def tile(log: Path, path: Path, seconds: float, seed: int) -> None:
+    """Write the periods of a session again and again, with fresh noise, one after the other."""
+    source = read_session(log)
     spans = source.spans("period")
     first, last = spans[0][0], spans[-1][1]
     length = last - first
@@ -92,10 +94,16 @@ def tile(source: Session, path: Path, seconds: float, seed: int) -> None:
             writer.advance(first + shift + length - 10**9)
 
 
+def elsewhere(work: Callable[..., object], *arguments: object) -> None:
+    """Work in a process of its own: the peak memory of a command begins with that of the process that starts it."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        pool.submit(work, *arguments).result()
+
+
 def as_csv(session: Path, path: Path) -> None:
-    """The joint channel of a session as a text file: times and, of each joint, position, velocity and torque."""
+    """The joint channel of a session as a text file: times and, of each joint, position and torque."""
     joint = read_session(session).joint
-    quantities = {"q": joint.position, "dq": joint.velocity, "tau": joint.effort}
+    quantities = {"q": joint.position, "tau": joint.effort}
     columns = {"time": (joint.log_time - joint.log_time[0]) * 1e-9}
     for name, values in quantities.items():
         columns |= {f"{name}{number + 1}": values[:, number] for number in range(values.shape[1])}
@@ -109,7 +117,7 @@ def command_of(name: str, folder: Path) -> list[str]:
     if name == "import":
         table = folder / "recording.csv"
         if not table.exists():
-            as_csv(Path(logs[0]), table)
+            elsewhere(as_csv, Path(logs[0]), table)
         (folder / "mapping.yaml").write_text(MAPPING)
         return ["import", str(folder / "mapping.yaml"), str(table), str(folder / "imported.mcap"), "--force"]
     return {
@@ -152,7 +160,7 @@ def prepared(logs: Path, folder: Path, sessions: int, minutes: float) -> Path:
     for number in range(sessions):
         path = place / f"session-{number:03d}.mcap"
         if not path.exists():
-            tile(read_session(logs / f"{NAMES[number % 2]}.mcap"), path, 60.0 * minutes, number)
+            elsewhere(tile, logs / f"{NAMES[number % 2]}.mcap", path, 60.0 * minutes, number)
     return place
 
 
@@ -160,7 +168,7 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("logs", type=Path, help="folder of an experiment with the emulator")
     parser.add_argument("--minutes", type=float, nargs="*", default=[1.0, 10.0, 30.0])
-    parser.add_argument("--sessions", type=int, nargs="*", default=[20, 200])
+    parser.add_argument("--sessions", type=int, nargs="*", default=[])
     parser.add_argument("--commands", nargs="+", default=list(COMMANDS), choices=COMMANDS)
     parser.add_argument("--folder", type=Path, default=Path("scale"), help="for the tiled sessions; kept")
     parser.add_argument(

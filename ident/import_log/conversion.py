@@ -22,6 +22,7 @@ from ident.import_log.tables import Floats
 from ident.import_log.turns import unwrapped
 from lwr_driver.configuration import find, yaml_text
 from lwr_driver.session import SessionWriter, session_metadata
+from lwr_driver.session.spool import spans, stored
 
 _ONCE = ("position", "velocity", "joint_torque")
 # Signals of one topic: their rows are written or left out together.
@@ -286,7 +287,8 @@ def _read(
             raise DataError(
                 f"{place} has {len(raw)} rows, the positions have {total}; the recording is not whole"
             )
-        raws[name], seconds[name] = _cut(raw, rows, place), _cut(clock, rows, place)
+        raws[name], seconds[name] = stored([_cut(raw, rows, place)]), _cut(clock, rows, place)
+        del raw
     for topic in _TOPICS:
         names = [name for name in topic if name in raws]
         if not names:
@@ -329,7 +331,7 @@ def _read(
             )
         # The source's own clock, counted from the first sample if it begins below zero.
         published = times - (0 if origin is None else origin)
-        values, wraps = _convert(mapping, name, signal, raws[name])
+        values, wraps = _convert(mapping, name, signal, raws.pop(name))
         for own, at in zip(mapping.joints, wraps, strict=True):
             if len(at):
                 since = float(times[at[0]] - times[0]) * 1e-9
@@ -376,8 +378,13 @@ def _one(file: str | tuple[str, ...] | None) -> str | None:
 
 def _repeated(channels: Mapping[str, _Channel]) -> int:
     """Samples equal to the one before in every value of `/joint_states`."""
-    values = np.hstack([channels[name].values for name in _ONCE if name in channels])
-    return int(np.count_nonzero((np.diff(values, axis=0) == 0.0).all(axis=1)))
+    once = [channels[name].values for name in _ONCE if name in channels]
+    alike = np.ones(len(once[0]) - 1, dtype=bool)
+    for values in once:
+        for some in spans(len(alike)):
+            block = values[some.start : some.stop + 1]
+            alike[some] &= (block[1:] == block[:-1]).all(axis=1)
+    return int(np.count_nonzero(alike))
 
 
 def _jumping(mapping: LogMapping, joint: _Channel) -> list[str]:
@@ -493,7 +500,9 @@ def _convert(
     if signal.before_gear:
         matrix = mapping.matrix
         values = values @ (matrix if signal.quantity == "torque" else np.linalg.inv(matrix).T)
-    return (values + mapping.offset if signal.quantity == "angle" else values), wraps
+    if signal.quantity == "angle" and np.any(mapping.offset):
+        values = values + mapping.offset
+    return stored([values]), wraps
 
 
 def _write(writer: SessionWriter, channels: Mapping[str, _Channel]) -> None:
