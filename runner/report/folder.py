@@ -22,6 +22,7 @@ from ident.model.model_file import read_model
 from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepared import Passage, PreparedSession
 from lwr_driver.session import Session, read_session
+from lwr_driver.session.spool import stored
 from runner.published import is_published_arm
 
 Floats = NDArray[np.float64]
@@ -101,7 +102,7 @@ def curves(
         ]
         if not parts:
             continue
-        columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        columns = {key: stored(part[key] for part in parts) for key in parts[0]}
         time = columns["time"]
         found.append(
             Curves(
@@ -111,7 +112,9 @@ def curves(
                 payload=payload,
                 joint_names=prepared.joint_names,
                 cutoff_hz=prepared.cutoff_hz,
-                raw_velocity=_velocity(chosen, time) if side == "joint" else np.empty((len(time), 0)),
+                raw_velocity=stored([_velocity(chosen, time)])
+                if side == "joint"
+                else np.empty((len(time), 0)),
                 whole=scored,
                 unseen=unseen,
                 **columns,
