@@ -118,23 +118,18 @@ class _Few:
     """Arrays in memory while they are few, and an arena for the others."""
 
     def __init__(self) -> None:
-        self._bytes, self._lock, self._arena = 0, threading.Lock(), Arena()
+        self._arena, self._held = Arena(), dict[int, int]()
 
     def keep(self, array: NDArray[Any]) -> NDArray[Any]:
         """The same array, in a file if those in memory are many; what is in a file already stays there."""
         if array.nbytes < _SMALL_BYTES or mapping(array) is not None:
             return array
-        with self._lock:
-            few = self._bytes + array.nbytes <= _MOST_BYTES
-            self._bytes += array.nbytes if few else 0
-        if not few:
+        if sum(list(self._held.values())) + array.nbytes > _MOST_BYTES:
             return self._arena.keep(array)
-        weakref.finalize(array, self._forget, array.nbytes)
+        # By one operation each, for an array may end anywhere: no lock could be taken there.
+        self._held[id(array)] = array.nbytes
+        weakref.finalize(array, self._held.pop, id(array), None).atexit = False
         return array
-
-    def _forget(self, count: int) -> None:
-        with self._lock:
-            self._bytes -= count
 
 
 _in_memory = _Few().keep
