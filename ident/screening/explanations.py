@@ -113,10 +113,16 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
         tried += [scored(candidate)[0] for candidate in _likely(_motions(data), tries=_motions(few))]
     tried += [scored(candidate)[0] for candidate in _likely(_of_parts(data, fit, normal), normal)]
     tried = [one for one in tried if believed(one, len(normal.classes))]
-    # Of the session as a whole before its half; of equals the later one, for what breaks was whole before.
-    ranked = {k: round(one.drop - _FINER * (len(one.parts) == 1), 2) for k, one in enumerate(tried)}
-    best = tried[max(ranked, key=lambda k: (ranked[k], k))] if tried else None
+    best = max(enumerate(tried), key=_rank, default=(0, None))[1]
     return None if best is None else _refined(best, before, normal)
+
+
+def _rank(numbered: tuple[int, Explanation]) -> tuple[float, bool, int]:
+    """Order of explanations: by their drop, a session before its half, all data before a part of them, and of equal
+    parts the later one, for what breaks was whole before."""
+    number, one = numbered
+    drop = round(one.drop - _FINER * (len(one.parts) == 1), 2)
+    return drop, not one.parts, number if one.parts else -number
 
 
 def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:

@@ -15,20 +15,21 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError, LwrError
 from ident.dynamics.structure import Side
-from ident.estimation.scores import Score, SessionScore, score_session
+from ident.estimation.scores import Predictor, Score, SessionScore, score_session
 from ident.estimation.validate import mounted, predictor, prepared_session, signals_for
 from ident.model import DynamicModel
 from ident.model.model_file import read_model
 from ident.rows.filters import ParallelFilter, SignalSettings
-from ident.rows.prepared import Passage, PreparedSession
+from ident.rows.prepared import Passage
 from lwr_driver.session import Session, read_session
-from lwr_driver.session.spool import stored
+from lwr_driver.session.spool import spans, stored, stored_together
 from runner.published import is_published_arm
 
 Floats = NDArray[np.float64]
 
 _ATTENUATION_DB = 40.0
 _RATE_PER_CUTOFF = 2.5
+_COLUMNS = ("time", "torque", "error", "q", "qd", "grid", "measured", "computed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +90,7 @@ def curves(
     settings : of the signals; default those of the model. unseen : held out.
     """
     payload = mounted(model, session)
-    prepared = prepared_session(model, session, settings)
+    prepared = prepared_session(model, session, settings, blocks=not model.remembers)
     predict = predictor(model, payload)
     scored = score_session(prepared, predict, model.structure.sides, session, "identified model")
     chosen = session.select(model.structure.chain.joint_names)
@@ -97,12 +98,11 @@ def curves(
     for side in model.structure.sides:
         if side not in scored.relative or side == "difference":
             continue
-        parts = [
-            part for passage in prepared.passages if (part := _part(passage, side, model, payload, prepared))
-        ]
-        if not parts:
+        parts = (_part(passage, side, predict, prepared.cutoff_hz) for passage in prepared.passages)
+        whole = stored_together(part for part in parts if part)
+        if not whole:
             continue
-        columns = {key: stored(part[key] for part in parts) for key in parts[0]}
+        columns = dict(zip(_COLUMNS, whole, strict=True))
         time = columns["time"]
         found.append(
             Curves(
@@ -112,9 +112,7 @@ def curves(
                 payload=payload,
                 joint_names=prepared.joint_names,
                 cutoff_hz=prepared.cutoff_hz,
-                raw_velocity=stored([_velocity(chosen, time)])
-                if side == "joint"
-                else np.empty((len(time), 0)),
+                raw_velocity=_velocity(chosen, time) if side == "joint" else np.empty((len(time), 0)),
                 whole=scored,
                 unseen=unseen,
                 **columns,
@@ -123,29 +121,35 @@ def curves(
     return found
 
 
-def _part(
-    passage: Passage, side: Side, model: DynamicModel, payload: str | None, prepared: PreparedSession
-) -> dict[str, Floats]:
+def _part(passage: Passage, side: Side, predict: Predictor, cutoff_hz: float) -> list[Floats]:
+    """The `_COLUMNS` of one passage, without the samples that it shares with its neighbours; none without a torque."""
     channel = passage.joint if side == "joint" else passage.motor
     if channel is None or not len(passage.rows) or not channel.torque.shape[1]:
-        return {}
-    computed = predictor(model, payload)(channel, side)
-    first, last = passage.rows[0], passage.rows[-1]
-    inside = (channel.times >= first) & (channel.times <= last)
+        return []
+    computed = predict(channel, side)
+    # A block goes on where the one before it ends.
+    begin, end = passage.core
+    first, last = (
+        (passage.rows[0] if begin == -np.inf else begin),
+        (passage.rows[-1] if end == np.inf else end),
+    )
+    inside = (channel.times >= first) & (channel.times <= last) & passage.own(channel.times)
     step = float(np.median(np.diff(channel.times)))
-    cutoff = min(prepared.cutoff_hz, 0.2 / step)
+    cutoff = min(cutoff_hz, 0.2 / step)
     grid = np.arange(first, last, 1.0 / (_RATE_PER_CUTOFF * cutoff))
     low_pass = ParallelFilter(channel.times, grid, cutoff, _ATTENUATION_DB)
-    return {
-        "time": channel.times[inside],
-        "torque": channel.torque[inside],
-        "error": (channel.torque - computed)[inside],
-        "q": channel.q[inside],
-        "qd": channel.qd[inside],
-        "grid": grid,
-        "measured": low_pass.apply(channel.torque),
-        "computed": low_pass.apply(computed),
-    }
+    found = [
+        channel.times[inside],
+        channel.torque[inside],
+        (channel.torque - computed)[inside],
+        channel.q[inside],
+        channel.qd[inside],
+        grid,
+        low_pass.apply(channel.torque),
+        low_pass.apply(computed),
+    ]
+    passage.release()
+    return found
 
 
 def _velocity(session: Session, time: Floats) -> Floats:
@@ -153,10 +157,15 @@ def _velocity(session: Session, time: Floats) -> Floats:
     joint = session.joint
     clock = joint.publish_time if np.ptp(joint.publish_time) > 0 else joint.log_time
     seconds = (clock - clock[0]) * 1e-9
-    speed = np.diff(joint.position, axis=0) / np.diff(seconds)[:, None]
     middle = 0.5 * (seconds[1:] + seconds[:-1])
-    nearest = np.clip(np.searchsorted(middle, time), 0, len(middle) - 1)
-    return np.asarray(speed[nearest], dtype=np.float64)
+
+    def at(times: Floats) -> Floats:
+        k = np.clip(np.searchsorted(middle, times), 0, len(middle) - 1)
+        return np.asarray(
+            (joint.position[k + 1] - joint.position[k]) / (seconds[k + 1] - seconds[k])[:, None]
+        )
+
+    return stored(at(time[some]) for some in spans(len(time)))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ def test_the_notebook_is_small_and_stores_its_outputs() -> None:
 
 
 # With the laboratory made, the code that both need is compiled, and not by two processes at once.
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("laboratory")
 def test_the_notebook_runs_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))

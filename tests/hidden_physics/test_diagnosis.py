@@ -95,7 +95,7 @@ def test_what_no_catalogue_has_is_flagged_and_not_surely_named(store: Store) -> 
     assert verdict.unexplained
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_how_late_the_motor_torques_are_is_told_between_whole_periods_of_the_commands(store: Store) -> None:
     """They are sampled every third command; 5 to 7 ms later they meet the ripple between two commands elsewhere."""
     case = draw(1, "single", store, causes=["motor_torque_delay"], size=1.5)

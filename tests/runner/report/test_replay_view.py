@@ -212,7 +212,7 @@ def test_a_browser_scrubs_through_the_replay(finished: Path, heavier: Path, chro
                 for width in (WIDE[0], NARROW[0]):
                     page.set_viewport_size({"width": width, "height": 360})
                     page.wait_for_timeout(500)
-                    assert page.get_by_role("slider", name="time [s]").count() == 1
+                    page.get_by_role("slider", name="time [s]").wait_for(timeout=120_000)
                     assert flaws(seen) == []
                     assert page.evaluate(CLIPPED) == []
             process.send_signal(signal.SIGINT)
