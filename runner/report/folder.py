@@ -127,12 +127,10 @@ def _part(passage: Passage, side: Side, predict: Predictor, cutoff_hz: float) ->
     if channel is None or not len(passage.rows) or not channel.torque.shape[1]:
         return []
     computed = predict(channel, side)
-    # A block goes on where the one before it ends.
     begin, end = passage.core
-    first, last = (
-        (passage.rows[0] if begin == -np.inf else begin),
-        (passage.rows[-1] if end == np.inf else end),
-    )
+    # A block goes on where the one before it ends.
+    first = begin if passage.continues else passage.rows[0]
+    last = end if end < np.inf else passage.rows[-1]
     inside = (channel.times >= first) & (channel.times <= last) & passage.own(channel.times)
     step = float(np.median(np.diff(channel.times)))
     cutoff = min(cutoff_hz, 0.2 / step)

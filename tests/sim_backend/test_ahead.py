@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -288,24 +289,28 @@ def _changed_program(folder: Path, statement: str) -> Path:
     return folder / KRL.name
 
 
-def test_nothing_is_offered_without_a_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+@contextlib.contextmanager
+def commanding(monkeypatch: pytest.MonkeyPatch) -> Iterator[Pair]:
+    """A pair in command mode."""
     pair = Pair(monkeypatch, 200, {"fri.program": OWN, "controller.settle_s": 0.05}, 0.0)
     try:
         pair.until(lambda: pair.cabinet.session.state is State.MON)
         assert pair.job(Job.START) is Result.DONE
-        assert pair.job(Job.CYCLES, 300) is Result.DONE
-        assert pair.blocks == 0
-        assert pair.loop.mode is Mode.HOLD
-        assert not len(pair.loop.offer(10))
+        yield pair
     finally:
         pair.close()
 
 
+def test_nothing_is_offered_without_a_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    with commanding(monkeypatch) as pair:
+        assert pair.job(Job.CYCLES, 300) is Result.DONE
+        assert pair.blocks == 0
+        assert pair.loop.mode is Mode.HOLD
+        assert not len(pair.loop.offer(10))
+
+
 def test_a_packet_sent_twice_during_a_pause_is_no_restart(monkeypatch: pytest.MonkeyPatch) -> None:
-    pair = Pair(monkeypatch, 250, {"fri.program": OWN, "controller.settle_s": 0.05}, 0.0)
-    try:
-        pair.until(lambda: pair.cabinet.session.state is State.MON)
-        assert pair.job(Job.START) is Result.DONE
+    with commanding(monkeypatch) as pair:
         assert pair.job(Job.CYCLES, 10) is Result.DONE
         # As after a reminder of a loop that waits for its driver.
         send, sent = pair.service.end.send, list[bytes]()
@@ -322,5 +327,3 @@ def test_a_packet_sent_twice_during_a_pause_is_no_restart(monkeypatch: pytest.Mo
         assert pair.job(Job.CYCLES, 10) is Result.DONE
         remote = pair.loop.remote
         assert (remote.repeated, remote.reordered, remote.restarts, remote.lost) == (2, 0, 0, 0)
-    finally:
-        pair.close()

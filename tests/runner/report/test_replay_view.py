@@ -212,7 +212,9 @@ def test_a_browser_scrubs_through_the_replay(finished: Path, heavier: Path, chro
                 for width in (WIDE[0], NARROW[0]):
                     page.set_viewport_size({"width": width, "height": 360})
                     page.wait_for_timeout(500)
-                    page.get_by_role("slider", name="time [s]").wait_for(timeout=120_000)
+                    slider = page.get_by_role("slider", name="time [s]")
+                    slider.wait_for(timeout=120_000)
+                    assert slider.count() == 1
                     assert flaws(seen) == []
                     assert page.evaluate(CLIPPED) == []
             process.send_signal(signal.SIGINT)
