@@ -370,6 +370,7 @@ def channel_delays(
         estimator="wls",
         signals=replace(settings.signals, stiffness_nm_rad=springs),
         coulomb=settings.law,
+        row_coulomb=settings.row_law,
         couplings=arm.couplings,
         essential=None,
     )

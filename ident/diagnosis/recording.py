@@ -126,7 +126,7 @@ def settled(
     )
     try:
         base = numeric_base(structure)
-        laws = (settings.law, None)
+        laws = (settings.law, settings.row_law)
         found = choose_signals(
             chosen, payloads, structure, base.columns, settings.signals, laws, recall=recall
         )
@@ -134,7 +134,7 @@ def settled(
         # The records say what is wrong with a session.
         logger.info("signal settings of the paper, because: %s", error)
         return settings
-    return replace(settings, signals=found.settings, law=found.coulomb)
+    return replace(settings, signals=found.settings, law=found.coulomb, row_law=found.row_coulomb)
 
 
 def record(

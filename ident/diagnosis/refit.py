@@ -57,6 +57,7 @@ def _identified(task: Task, nominal: Nominal, sessions: Sequence[Session]) -> Dy
         without=structure.without,
         couplings=structure.couplings,
         coulomb=task.settings.law,
+        row_coulomb=task.settings.row_law,
         essential=None,
     )
     chosen = Known(signal_reasons=("signal settings of the diagnosis",))

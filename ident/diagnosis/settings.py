@@ -21,7 +21,8 @@ class DiagnosisSettings:
     ringing_s : the same for positions of the motors: about one period of the links on their springs, invisible in
         motors held by friction.
     signals : from channels to filtered motion, as for `identify`; what is open is chosen from the data. law : of
-        Coulomb friction in the resulting models, None for the one that predicts best.
+        Coulomb friction in the resulting models, None for the one that predicts best. row_law : that of the rows that
+        they are estimated from, None for the same.
     deflection_hz : low-pass on the torque for the joints' twist.
     standstill_rad_s : rows of a joint below this speed are left out, for their friction is unknown.
     reversal_s : rows this close to a reversal are left out: the motor may reverse later.
@@ -43,6 +44,7 @@ class DiagnosisSettings:
     ringing_s: float = 0.1
     signals: SignalSettings = field(default_factory=SignalSettings)
     law: Coulomb | None = None
+    row_law: Coulomb | None = None
     deflection_hz: float = 30.0
     standstill_rad_s: float = 0.01
     reversal_s: float = 0.015

@@ -341,7 +341,7 @@ def commanded(session: Session, prepared: PreparedSession) -> PreparedSession | 
     joint, command = session.joint, session.command.select(prepared.joint_names)
     times = np.asarray((clock_ns(command) - int(clock_ns(joint)[0])) * 1e-9, dtype=np.float64)
     where = f"{prepared.name}: /joint_command"
-    dt = sample_period(times, command.sequence if command.numbered else None, where)
+    dt = sample_period(times, command.counts, where)
     bad: NDArray[np.bool_] = np.asarray(~np.isfinite(command.position).all(axis=1))
     wraps = [jump.behind for jump in jumps(times, command.position)]
     parts, _ = stretches(times, command.position, bad, dt, prepared.settings.longest_bridge_s, wraps)

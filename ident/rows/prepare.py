@@ -95,8 +95,7 @@ def prepare(
                 "with a session with motor torques"
             )
         effort = np.zeros_like(position)
-    sequence = session.joint.sequence if session.joint.numbered else None
-    dt = sample_period(times, sequence, f"{name}: /joint_states")
+    dt = sample_period(times, session.joint.counts, f"{name}: /joint_states")
     settings = (settings or SignalSettings()).settled(1.0 / dt)
     warnings: list[str] = []
     position_flags, crowded = _outliers(position, settings, recall)

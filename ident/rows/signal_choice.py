@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from fri.errors import DataError
 from ident.dynamics.parameters import Floats, split_name
 from ident.dynamics.structure import Coulomb, ModelStructure
 from ident.rows.binned import BinnedRows, observe_bins
@@ -260,6 +261,11 @@ class _Bench:
                         acting,
                         len(self.columns),
                     )
+        if not found:
+            raise DataError(
+                f"no interval of {1e3 * BIN_S:.0f} ms in {len(self.sessions)} sessions has all samples of a torque: "
+                "too many are lost by the counter, or flagged; record without losses, or import without the counter"
+            )
         return found
 
     def _smooth(self, values: Floats, rows: BinnedRows) -> Floats:

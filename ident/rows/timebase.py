@@ -92,8 +92,8 @@ def _spline(places: Floats, values: Floats) -> Any:
     return CubicSpline(places, values)
 
 
-def sample_period(times: Floats, sequence: NDArray[np.int64] | None, where: str) -> float:
-    """Sample time [s]: median interval per step of the sequence counter (n,)."""
+def sample_period(times: Floats, counts: NDArray[np.int64] | None, where: str) -> float:
+    """Sample time [s]: median interval per step of the sample's number (n,)."""
     if len(times) < 16:
         raise DataError(f"{where}: {len(times)} samples are too few; record at least a few seconds of motion")
     step = np.diff(times)
@@ -102,8 +102,8 @@ def sample_period(times: Floats, sequence: NDArray[np.int64] | None, where: str)
         raise DataError(
             f"{where}: time does not increase after t = {at:.6f} s; repair the clock of the source"
         )
-    if sequence is not None and len(sequence) == len(times) and np.all(np.diff(sequence) > 0):
-        return float(np.median(step / np.diff(sequence)))
+    if counts is not None and len(counts) == len(times) and np.all(np.diff(counts) > 0):
+        return float(np.median(step / np.diff(counts)))
     return float(np.median(step))
 
 

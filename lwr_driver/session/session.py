@@ -18,6 +18,8 @@ from fri.errors import ConfigurationError, DataError
 from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.notebook import optional, subplots
 
+# Steps of a counter that by chance have hardly ever a common divisor.
+_LEAST_STEPS = 16
 _WIDEST = 120
 """Characters of a line of a `repr`."""
 
@@ -76,11 +78,22 @@ class JointColumns:
         return bool(self.sequence.any())
 
     @property
+    def counts(self) -> NDArray[np.int64] | None:
+        """Number (n,) of each sample by the counter, None without one. Where every k-th sample of the source is
+        recorded, these are counted and none is lost in between."""
+        if not self.numbered:
+            return None
+        steps = np.diff(self.sequence)
+        stride = int(np.gcd.reduce(steps)) if len(steps) >= _LEAST_STEPS else 1
+        return self.sequence // max(stride, 1)
+
+    @property
     def gaps(self) -> tuple[Gap, ...]:
         """Lost samples by the counter of the source; empty without a counter."""
-        if not self.numbered:
+        counts = self.counts
+        if counts is None:
             return ()
-        steps = np.diff(self.sequence)
+        steps = np.diff(counts)
         return tuple(
             Gap(int(row) + 1, int(steps[row]) - 1, int(self.log_time[row]), int(self.log_time[row + 1]))
             for row in np.flatnonzero(steps > 1)

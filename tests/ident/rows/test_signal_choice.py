@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from fri.errors import DataError
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.structure import Coulomb, ModelStructure
 from ident.rows.class_rows import ClassRows, blocks, error, fit
@@ -42,6 +43,18 @@ def test_stated_figures_stay():
     law = Coulomb("tanh", 0.01)
     found = chosen(arm.session(motor=False), settings, law)
     assert (found.settings, found.coulomb, found.row_coulomb, found.reasons) == (settings, law, law, ())
+
+
+def test_a_recording_with_holes_in_every_interval_is_refused_with_advice():
+    session = arm.session(motor=False, sensors=sensors())
+    kept = np.ones(len(session.joint), dtype=bool)
+    kept[3 : len(kept) - 3 : 5] = False
+    fields = ("log_time", "publish_time", "sequence", "position", "velocity", "effort")
+    joint = dataclasses.replace(
+        session.joint, **{name: getattr(session.joint, name)[kept] for name in fields}
+    )
+    with pytest.raises(DataError, match=r"lost by the counter.*record without losses"):
+        chosen(dataclasses.replace(session, joint=joint))
 
 
 def test_a_fast_motion_has_a_wider_band_of_rows_and_positions():

@@ -245,6 +245,17 @@ def test_lost_samples_are_seen(tmp_path):
     assert session.end["missed"] == "27"
 
 
+def test_a_log_of_every_kth_sample_has_lost_none_of_the_others(tmp_path):
+    path = tmp_path / "a.mcap"
+    position, _ = signals(20)
+    sequence = 7 + 4 * np.delete(np.arange(22), [9, 10])
+    with SessionWriter(path, JOINTS, METADATA) as writer:
+        writer.write_joint_states(EPOCH + sequence * 1_000_000, position, sequence=sequence)
+    joint = read_session(path).joint
+    assert [(gap.row, gap.lost) for gap in joint.gaps] == [(9, 2)]
+    assert np.diff(joint.counts).tolist() == [1] * 8 + [3] + [1] * 10
+
+
 def test_samples_without_numbers_are_said_to_be(tmp_path):
     path = tmp_path / "a.mcap"
     position, _ = signals(5)
