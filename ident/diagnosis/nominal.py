@@ -584,14 +584,15 @@ class Nominal:
     def _moves(self, stretch: RecordStretch, speed: Floats, at: Floats) -> NDArray[np.bool_]:
         """Whether joints move in one direction for a while before and after times (m,), (m, n)."""
         dt = float(stretch.time[1] - stretch.time[0])
-        size = 2 * round(self.settings.reversal_s / dt) + 1
+        least = self.settings.standstill_rad_s
+        # The low-pass of the positions spreads a start or a stop by half a period of its cut-off to either side.
+        size = 2 * round(max(self.settings.reversal_s, 0.5 / self.settings.signals.cutoff) / dt) + 1
         found = np.empty((len(at), speed.shape[1]), dtype=bool)
         for joint in range(speed.shape[1]):
             # One joint of a long session at a time.
             own = column(speed, joint)
-            steady = (minimum_filter1d(own, size) > 0.0) | (maximum_filter1d(own, size) < 0.0)
-            moves = np.abs(_at(stretch.time, own[:, None], at)) > self.settings.standstill_rad_s
-            found[:, joint] = (moves & (_at(stretch.time, steady[:, None].astype(float), at) > 0.999))[:, 0]
+            steady = (minimum_filter1d(own, size) > least) | (maximum_filter1d(own, size) < -least)
+            found[:, joint] = _at(stretch.time, steady[:, None].astype(float), at)[:, 0] > 0.999
         return found
 
     def _matrix(

@@ -16,7 +16,7 @@ from ident.diagnosis.signatures import signature_bench
 from ident.diagnosis.tolerances import tolerances
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
-from ident.rows.filters import low_pass
+from ident.rows.filters import SignalSettings, low_pass
 from lwr_driver.session import JointColumns, Session
 
 NOISE = 0.04
@@ -223,3 +223,21 @@ def test_a_fit_of_no_possible_arm_leaves_links_that_move_on_springs() -> None:
         assert np.abs(motion.q).max() < 10.0
     for rows in nominal.rows.values():
         assert np.isfinite(rows.matrix[rows.valid.T]).all()
+
+
+def test_rows_beside_a_start_or_a_stop_are_left_out_as_far_as_the_low_pass_reaches() -> None:
+    """The filtered speed of a joint that starts is above zero before it moves, and no friction follows it."""
+    recorded, cutoff = session(rate=100.0), 8.0
+    joint, time = recorded.joint, np.arange(0.0, 12.0, 0.01)
+    place = np.clip(np.mod(time, 2.0), 0.0, 1.0)
+    step = place**3 * (10.0 - 15.0 * place + 6.0 * place**2)
+    position = np.where(np.mod(time, 4.0) < 2.0, step, 1.0 - step)
+    moved = replace(joint, position=np.column_stack([position, joint.position[:, 1]]))
+    settings = DiagnosisSettings(signals=SignalSettings(cutoff_hz=cutoff))
+    bench = signature_bench([replace(recorded, joint=moved)], arm(), settings=settings)
+    for rows in bench.nominal.rows.values():
+        valid = rows.time[rows.valid[:, 0]]
+        assert len(valid) > 50
+        since = np.mod(valid, 2.0)
+        assert since.min() > 0.5 / cutoff
+        assert since.max() < 1.0 - 0.5 / cutoff
