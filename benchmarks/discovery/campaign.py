@@ -170,7 +170,7 @@ def _twin_errors(store: Store, healthy: Case, reference: Path | None) -> np.ndar
     if kept.is_file():
         return np.array(json.loads(kept.read_text()))
     diagnosis, _ = diagnosed(store.sessions(healthy), reference)
-    errors = error_rows(diagnosis["baseline"]["test_rms"])
+    errors = error_rows(diagnosis["gain"]["test_rms_base"])
     kept.write_text(json.dumps(errors.tolist()))
     return errors
 

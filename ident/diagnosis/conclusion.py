@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,20 +12,22 @@ from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, doubted
 from ident.diagnosis.evidence import Floats
-from ident.diagnosis.extension import Member, TorqueErrors, extension, power_left, title
+from ident.diagnosis.extension import Member, extension, power_left, title
 from ident.diagnosis.findings import limit_findings, loss_finding
-from ident.diagnosis.held_out import held_out
+from ident.diagnosis.held_out import HeldOut, held_out
 from ident.diagnosis.models import changes_of, fitted_models, lasting, without_harm
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
 from ident.diagnosis.payloads import unchecked_masses
 from ident.diagnosis.probes import Remainder, find_remainders
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.refit import left_by, refitted
-from ident.diagnosis.result import Diagnosis, Finding, RowStates, Unexplained
+from ident.diagnosis.result import Diagnosis, Finding, Nameless, RowStates, Unexplained
 from ident.diagnosis.task import Baseline, State, Task
 from ident.diagnosis.tolerances import GAIN, HABIT, SIZE
+from ident.diagnosis.torque_errors import TorqueErrors, errors_of_both
 from ident.diagnosis.wear import is_level, wear
 from ident.effects import EFFECTS
+from ident.model import DynamicModel
 from ident.rows.data_quality import sample_loss
 
 
@@ -66,11 +69,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
         if r.terms
     ]
     members, after = extension(bench, baseline, members, nuisance, settings.seed)
-    by_identify = task.sound and evidence.drawn
-    refuted: list[Finding] = []
-    if not by_identify:
-        members, after, refuted = without_harm(task, state, baseline, members, after)
-    findings = [contradicted(f) if any(f is r for r in refuted) else f for f in findings]
+    told = _told_models(task, state, baseline, members, after)
+    findings = [contradicted(f) if any(f is r for r in told.refuted) else f for f in findings]
     doubts += [f for f in findings if not believable(f.grounds)]
     findings = [f for f in findings if believable(f.grounds)]
     findings += [*state.timing, *state.loads, *worn]
@@ -80,29 +80,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
     findings += limit_findings(nominal.recordings, findings)
     doubts = [d for d in doubts if not any((d.cause, d.joints) == (f.cause, f.joints) for f in findings)]
     findings.sort(key=lambda f: -f.gain)
-    made = fitted_models(task, state, baseline, members, after)
-    base_model, extended = made.base, made.extended
-    changes = changes_of(base_model, extended) if made.added else {}
-    before, after = baseline.held.where(after), after.where(baseline.held)
-    extended_rms = after.rms()
-    added = tuple(map(title, made.added))
-    notes = state.notes
-    if by_identify:
-        try:
-            base_model, extended = refitted(task, nominal, made.added)
-        except DataError as error:
-            notes = (*notes, f"the models are those of the evidence, for `identify` says: {error}")
-        else:
-            if nominal.held_out:
-                before, after = (left_by(m, nominal, h) for m, h in ((base_model, before), (extended, after)))
-                errors, of_base = (TorqueErrors.of(m, task.test) for m in (extended, base_model))
-                if power_left(before, after) >= 1.0 or errors.left_of(of_base) > 1.0:
-                    extended, after = base_model, before
-                extended_rms = after.rms()
-            own = {title(entry) for entry in base_model.effects}
-            added = tuple(name for name in map(title, extended.effects) if name not in own)
-            changes = changes_of(base_model, extended) if added else {}
-    fitted = {(term.side, term.joint) for term in made.nameless}
+    fitted = {(term.side, term.joint) for term in told.nameless}
+    extended_rms = told.after.rms()
     left = [
         (r.side, r.joint, r.depends_on)
         for r in remainders
@@ -111,9 +90,9 @@ def conclude(task: Task, state: State) -> Diagnosis:
     replayed = list(task.test) or list(task.sessions)
     simulation = extended_simulation = None
     if task.simulate is not None:
-        simulation = task.simulate(task.model or base_model, replayed)
-        changed = extended.effects != base_model.effects
-        extended_simulation = task.simulate(extended, replayed) if changed else simulation
+        simulation = task.simulate(task.model or told.base, replayed)
+        changed = told.extended.effects != told.base.effects
+        extended_simulation = task.simulate(told.extended, replayed) if changed else simulation
     is_character = {id(f): task.reference is None and EFFECTS[f.cause].character for f in findings}
     return Diagnosis(
         train=tuple(r.name for r in nominal.recordings if not r.test),
@@ -122,8 +101,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
         findings=tuple(f for f in findings if not is_character[id(f)]),
         character=tuple(f for f in findings if is_character[id(f)]),
         doubted=tuple(doubts),
-        nameless=made.nameless,
-        extension=added,
+        nameless=told.nameless,
+        extension=told.added,
         unexplained=tuple(
             Unexplained(
                 side, j, variables, float(extended_rms[side][j - 1]), float(evidence.floor[side][j - 1])
@@ -131,19 +110,80 @@ def conclude(task: Task, state: State) -> Diagnosis:
             for side, j, variables in (*_stuck(nominal), *left)
         ),
         noise_floor=evidence.floor,
-        rms_base=before.rms(),
+        rms_base=told.before.rms(),
         rms_extended=extended_rms,
-        base_model=base_model,
-        extended_model=extended,
-        changes=changes,
+        base_model=told.base,
+        extended_model=told.extended,
+        changes=told.changes,
         scores=state.selection.scores,
         nuisance=state.selection.nuisance,
         simulation_base=simulation,
         simulation_extended=extended_simulation,
-        notes=(*_notes(bench, task.reference), *_channel_notes(nominal, remainders), *notes),
-        residuals={"base": before.residual, "extended": after.residual},
-        states={side: _states(nominal, side, before.block[side]) for side in nominal.rows},
+        notes=(
+            *_notes(bench, task.reference),
+            *_channel_notes(nominal, remainders),
+            *state.notes,
+            *told.notes,
+        ),
+        residuals={"base": told.before.residual, "extended": told.after.residual},
+        states={side: _states(nominal, side, told.before.block[side]) for side in nominal.rows},
+        torque_base=None if told.errors is None else told.errors[0],
+        torque_extended=None if told.errors is None else told.errors[1],
     )
+
+
+class _Told(NamedTuple):
+    """The models of the diagnosis. added : what the extended one has more. changes : of its base parameters. before,
+    after : held-out rows without and with the extension. refuted : findings with an effect that raises the torque error
+    of the test sessions. errors : of base and extended model there, None without test sessions."""
+
+    base: DynamicModel
+    extended: DynamicModel
+    added: tuple[str, ...]
+    nameless: tuple[Nameless, ...]
+    changes: Mapping[str, float]
+    before: HeldOut
+    after: HeldOut
+    refuted: tuple[Finding, ...]
+    errors: tuple[TorqueErrors, TorqueErrors] | None
+    notes: tuple[str, ...] = ()
+
+
+def _told_models(
+    task: Task, state: State, baseline: Baseline, members: list[Member], after: HeldOut
+) -> _Told:
+    """Base and extended model, by the evidence or by `identify`, and what they leave in the held-out data.
+
+    members : of the extension. after : held-out rows with them.
+    """
+    nominal, errors = state.bench.nominal, None
+    refuted: tuple[Finding, ...] = ()
+    notes: tuple[str, ...] = ()
+    by_identify = task.sound and state.bench.evidence.drawn
+    if task.test and not by_identify:
+        _, after, made, refuted, errors = without_harm(task, state, baseline, members, after)
+    else:
+        made = fitted_models(task, state, baseline, members, after)
+    base, extended = made.base, made.extended
+    before, after = baseline.held.where(after), after.where(baseline.held)
+    added = tuple(map(title, made.added))
+    if by_identify:
+        try:
+            base, extended = refitted(task, nominal, made.added)
+        except DataError as error:
+            notes = (f"the models are those of the evidence, for `identify` says: {error}",)
+        else:
+            if nominal.held_out:
+                before, after = (left_by(m, nominal, h) for m, h in ((base, before), (extended, after)))
+                errors = errors_of_both(base, extended, task.test)
+                if power_left(before, after) >= 1.0 or errors[1].left_of(errors[0]) > 1.0:
+                    extended, after, errors = base, before, (errors[0], errors[0])
+            own = {title(entry) for entry in base.effects}
+            added = tuple(name for name in map(title, extended.effects) if name not in own)
+        if task.test and errors is None:
+            errors = errors_of_both(base, extended, task.test)
+    changes = changes_of(base, extended) if added else {}
+    return _Told(base, extended, added, made.nameless, changes, before, after, refuted, errors, notes)
 
 
 def _states(nominal: Nominal, side: str, block: Floats) -> RowStates:

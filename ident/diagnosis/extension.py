@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
-from ident.diagnosis.evidence import Floats, Rows
-from ident.diagnosis.held_out import FELT_WORSE, HeldOut, held_out, interval, worse_rows
+from ident.diagnosis.evidence import Rows
+from ident.diagnosis.held_out import HeldOut, held_out, interval, worse_rows
 from ident.diagnosis.probes import Remainder
 from ident.diagnosis.result import Finding, Nameless
 from ident.diagnosis.task import Baseline
 from ident.effects import NAMELESS, entry_of
-from ident.estimation.identify import Known
-from ident.estimation.validate import validate
-from ident.model import DynamicModel
-from lwr_driver.session import Session
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,35 +70,6 @@ def power_left(before: HeldOut, after: HeldOut) -> float:
     was, now = before.where(after).rms(), after.where(before).rms()
     share = np.concatenate([(now[side] / np.maximum(was[side], 1e-12)) ** 2 for side in was])
     return float(np.nanmean(share))
-
-
-class TorqueErrors(NamedTuple):
-    """Errors with all samples, as `validate` measures them: relative ones by session and side, and the rms [Nm] by
-    session, side and joint."""
-
-    sides: Floats
-    joints: Floats
-
-    @classmethod
-    def of(cls, model: DynamicModel, sessions: Sequence[Session]) -> TorqueErrors:
-        """Of a model in sessions."""
-        scores = validate(model, sessions, allow_seen=True, keep_going=True, known=Known()).scores
-        return cls(
-            np.array([error for score in scores for error in score.relative.values()]),
-            np.array([one.rms for score in scores for one in score.scores]),
-        )
-
-    def left_of(self, base: TorqueErrors) -> float:
-        """Mean square of the joints' errors over those of the base model, each by its own measure: chance in a large
-        one is more than the whole of a small one. Infinite where a side's error is felt to be larger or one is missing,
-        one where the base model has none.
-        """
-        if not np.isfinite(base.joints).any():
-            return 1.0
-        if self.joints.shape != base.joints.shape or np.any(self.sides > (1.0 + FELT_WORSE) * base.sides):
-            return np.inf
-        squares = (self.joints / np.maximum(base.joints, 1e-12)) ** 2
-        return float(np.mean(squares[np.isfinite(squares)]))
 
 
 def nameless_terms(

@@ -15,13 +15,14 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.evidence import Floats, Rows
-from ident.diagnosis.extension import Member, TorqueErrors, held_out_with, nameless_terms
+from ident.diagnosis.extension import Member, held_out_with, nameless_terms
 from ident.diagnosis.held_out import HeldOut
 from ident.diagnosis.nominal import GAIN_STD
 from ident.diagnosis.result import Finding, Nameless
 from ident.diagnosis.selection import Selection
 from ident.diagnosis.task import Baseline, ModelFit, State, Task
 from ident.diagnosis.tolerances import COMPLIANCE, GAIN, LENGTH, SIZE, TURNING
+from ident.diagnosis.torque_errors import TorqueErrors, errors_of_both
 from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of, parameter_values, sized
 from ident.estimation.turning import drive_coulomb
 from ident.model import DynamicModel
@@ -138,33 +139,40 @@ def turning_friction(
     ]
 
 
+class Harmless(NamedTuple):
+    """Members of the extension, the held-out rows and the models with them, the findings that went, and the errors of
+    base and extended model in the held-out sessions."""
+
+    members: list[Member]
+    after: HeldOut
+    made: Models
+    refuted: tuple[Finding, ...]
+    errors: tuple[TorqueErrors, TorqueErrors]
+
+
 def without_harm(
     task: Task, state: State, baseline: Baseline, members: list[Member], after: HeldOut
-) -> tuple[list[Member], HeldOut, list[Finding]]:
-    """The members without those that raise the torque error of the held-out sessions, the rows with them, and the
-    findings that went.
+) -> Harmless:
+    """The members without those that raise the torque error of the held-out sessions.
 
     The rows end at the parallel filter's band; the torque error has all samples, as users compute the torque.
     """
-    if not task.test or not members:
-        return members, after, []
     bench, nuisance = state.bench, state.selection.nuisance_rows
     refuted: list[Finding] = []
     made = fitted_models(task, state, baseline, members, after)
-    base, extended = (TorqueErrors.of(model, task.test) for model in (made.base, made.extended))
-    left = extended.left_of(base)
-    while members and left > 1.0:
+    base, errors = errors_of_both(made.base, made.extended, task.test)
+    while members and errors.left_of(base) > 1.0:
         found = []
         for member in members:
             rest = [m for m in members if m is not member]
             held = held_out_with(bench, rest, nuisance)
-            model = fitted_models(task, state, baseline, rest, held).extended
-            found.append((TorqueErrors.of(model, task.test).left_of(base), member))
-        left, worst = min(found, key=lambda pair: pair[0])
+            models = fitted_models(task, state, baseline, rest, held)
+            found.append((TorqueErrors.of(models.extended, task.test), models, held, member))
+        errors, made, after, worst = min(found, key=lambda one: one[0].left_of(base))
         members = [m for m in members if m is not worst]
         refuted += [worst.finding] if worst.finding is not None else []
-        after = held_out_with(bench, members, nuisance)
-    return members, after, refuted
+        held_out_with(bench, members, nuisance)
+    return Harmless(members, after, made, tuple(refuted), (base, errors))
 
 
 def changes_of(base: DynamicModel, extended: DynamicModel) -> dict[str, float]:

@@ -14,6 +14,7 @@ from ident.diagnosis.broken_data import BrokenChannel
 from ident.diagnosis.claims_in_words import finding_statement
 from ident.diagnosis.evidence import Floats
 from ident.diagnosis.statements import Statements, statements
+from ident.diagnosis.torque_errors import TorqueErrors
 from ident.dynamics.tables import Tabular
 from ident.effects.words import quantity_text
 from ident.model import DynamicModel
@@ -186,6 +187,8 @@ class Diagnosis(Tabular):
     unexplained : remainders that could not be fitted. extension : `cause(joints)` of all in the extended model.
     base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
     changes : change of the base parameters by the extension, in their standard deviations.
+    rms_base, rms_extended : rms error (n,) [Nm] by side in the held-out rows, beside the noise_floor of these rows.
+    torque_base, torque_extended : errors of the models in the test sessions with all samples, None without any.
     notes : sentences on limits of the data. data : broken channels, left out.
     residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN in unused rows.
     states : of the arm in these rows, by side.
@@ -214,6 +217,19 @@ class Diagnosis(Tabular):
     residuals: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict, repr=False)
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
     data: tuple[BrokenChannel, ...] = ()
+    torque_base: TorqueErrors | None = None
+    torque_extended: TorqueErrors | None = None
+
+    @property
+    def torque_rms_base(self) -> dict[str, Floats]:
+        """Rms error (n,) [Nm] of the base model by side, all samples of the test sessions pooled, as `validate`
+        measures it; empty without test sessions, without a side that has no score. `rms_base` is that of the rows."""
+        return {} if self.torque_base is None else self.torque_base.rms()
+
+    @property
+    def torque_rms_extended(self) -> dict[str, Floats]:
+        """The same of the extended model; `rms_extended` is that of the rows."""
+        return {} if self.torque_extended is None else self.torque_extended.rms()
 
     @property
     def claims(self) -> tuple[Finding, ...]:
@@ -259,7 +275,7 @@ class Diagnosis(Tabular):
         return axes
 
     def to_dict(self) -> dict[str, Any]:
-        """Content of `diagnosis.json`, with null for missing simulation errors."""
+        """Content of `diagnosis.json`, with null for missing errors."""
         none = {"motor": None, "joint": None, "position": None}
         base = self.simulation_base.to_dict() if self.simulation_base else none
         extended = self.simulation_extended.to_dict() if self.simulation_extended else none
@@ -287,8 +303,12 @@ class Diagnosis(Tabular):
                 for u in self.unexplained
             ],
             "gain": {
-                "test_rms_base": _sides(self.rms_base),
-                "test_rms_extended": _sides(self.rms_extended),
+                "test_rms_base": _sides(self.rms_base if self.torque_base is None else self.torque_rms_base),
+                "test_rms_extended": _sides(
+                    self.rms_extended if self.torque_extended is None else self.torque_rms_extended
+                ),
+                "rows_base": _sides(self.rms_base),
+                "rows_extended": _sides(self.rms_extended),
                 "simulation_error_base": base,
                 "simulation_error_extended": extended,
                 "simulation": dict(self.simulation_base.method) if self.simulation_base else {},

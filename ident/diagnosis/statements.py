@@ -386,37 +386,37 @@ def _unexplained(content: Plain, names: Sequence[str]) -> Part:
 
 
 def _gain(content: Plain, details: Plain, names: Sequence[str]) -> Part:
+    """Errors by joint and side: of test sessions first with all samples, then in the rows of the diagnosis."""
     gain = content.get("gain") or {}
-    base, extended = gain.get("test_rms_base") or {}, gain.get("test_rms_extended") or {}
     floor = (content.get("baseline") or {}).get("noise_floor") or {}
     measured = {(row["side"], row["joint"]): row for row in details.get("rows", [])}
     is_named = is_extended(content)
+    sessions = ", ".join((content.get("sessions") or {}).get("test") or [])
+    both = bool(sessions) and "rows_base" in gain
     rows: list[Row] = []
-    for side in base:
-        for k, before in enumerate(base[side] or ()):
-            after = (extended.get(side) or [])[k] if extended.get(side) else None
-            low = floor.get(side) or []
+    for side, errors in (gain.get("rows_base" if both else "test_rms_base") or {}).items():
+        for k in range(len(errors or ())):
             row = measured.get((side, k + 1), {})
-            cells: list[str | Number] = [
-                f"{_name(k + 1, names)} {side}",
-                Number(low[k] if k < len(low) else None, ".4f"),
-                Number(before, ".4f", f"gain.test_rms_base.{side}.{k}"),
-            ]
+            share, span = row.get("avoidable_share"), row.get("gain_interval_95")
+            noise = Number(_at(floor, side, k), ".4f")
+            shown = _models(gain, "test_rms", side, k)[: 1 + is_named]
+            change = [_change(*shown)] if is_named else []
+            cells: list[str | Number] = [noise, *shown, *change]
+            if both:
+                cells = [*shown, *change, noise, *_models(gain, "rows", side, k)[: 1 + is_named]]
             if is_named:
-                change = None if not before or after is None else 100 * (after / before - 1)
-                span = row.get("gain_interval_95")
-                cells += [
-                    Number(after, ".4f", f"gain.test_rms_extended.{side}.{k}"),
-                    Number(change, "+.1f"),
-                    "–" if not span else f"{span[0]:+.4f} to {span[1]:+.4f}".replace("-", "\N{MINUS SIGN}"),
-                ]
-            share = row.get("avoidable_share")
-            rows.append((*cells, Number(None if share is None else 100 * share, ".0f")))
+                text = "–" if not span else f"{span[0]:+.4f} to {span[1]:+.4f}"
+                cells.append(text.replace("-", "\N{MINUS SIGN}"))
+            cells.append(Number(None if share is None else 100 * share, ".0f"))
+            rows.append((f"{_name(k + 1, names)} {side}", *cells))
     if not rows:
         return Part("gain", "Gain")
-    sessions = ", ".join((content.get("sessions") or {}).get("test") or [])
     held_out = sessions or "each part of the motion, predicted from the others"
     sentences = [f"Root mean square errors below are on held-out data: {held_out}."]
+    if both:
+        sentences.append(
+            "First with all samples, as `validate` measures them; then in the rows of the diagnosis, without reversals."
+        )
     whole, worse = extension_gain(content), _worse(details, names) if is_named else []
     if whole is not None:
         sentences.append(f"Mean over joints and sides: {error_change(whole)} error.")
@@ -427,9 +427,33 @@ def _gain(content: Plain, details: Plain, names: Sequence[str]) -> Part:
         sentences.append(
             f"Torque error of {entry['session']} (all samples, as of `validate`): {', '.join(parts)}."
         )
-    middle = ("extended [Nm]", "change %", "gain [Nm], 95 %") if is_named else ()
-    head = ("torque", "noise [Nm]", "base model [Nm]", *middle, "avoidable %")
+    more, inside = ["extended [Nm]", "change %"] * is_named, ["gain [Nm], 95 %"] * is_named
+    head = ["torque", "noise [Nm]", "base model [Nm]", *more, *inside, "avoidable %"]
+    if both:
+        more, inside = ["extended", "change %"] * is_named, ["rows: extended", "gain, 95 %"] * is_named
+        head = ["rms [Nm]", "base", *more, "rows: noise", "rows: base", *inside, "avoidable %"]
     return Part("gain", "Gain" if is_named else "Error on held-out data", sentences, head, rows)
+
+
+def _models(gain: Plain, kind: str, side: str, joint: int) -> list[Number]:
+    """Errors [Nm] of base and extended model at a joint (from 0), `kind` with all samples (`test_rms`) or in the
+    rows."""
+    keys = (f"{kind}_base", f"{kind}_extended")
+    return [
+        Number(_at(gain.get(key) or {}, side, joint), ".4f", f"gain.{key}.{side}.{joint}") for key in keys
+    ]
+
+
+def _change(before: Number, after: Number) -> Number:
+    """Change of an error in percent."""
+    if not before.value or after.value is None:
+        return Number(None)
+    return Number(100 * (after.value / before.value - 1), "+.1f")
+
+
+def _at(table: Plain, side: str, joint: int) -> float | None:
+    values = table.get(side) or ()
+    return values[joint] if joint < len(values) else None
 
 
 def _percents(side: str, errors: Plain, is_named: bool) -> str:

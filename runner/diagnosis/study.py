@@ -21,9 +21,7 @@ from ident.diagnosis.statements import Statements, statements
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.session_chain import session_chain
 from ident.effects import find_effect
-from ident.estimation.identify import Known
 from ident.estimation.scores import finite
-from ident.estimation.validate import validate
 from ident.model import DynamicModel
 from ident.model.model_file import write_model
 from lwr_driver.arm import Arm
@@ -203,17 +201,13 @@ def study(
         _first_replay(replay),
         material=Material(tuple(sessions), chain, data, healthy),
         sure=sure,
-        torque_errors=_torque_errors(found, held_out),
+        torque_errors=_torque_errors(found),
     )
 
 
-def _torque_errors(found: Diagnosis, sessions: Sequence[Session]) -> tuple[Mapping[str, Any], ...]:
-    if not sessions:
+def _torque_errors(found: Diagnosis) -> tuple[Mapping[str, Any], ...]:
+    if found.torque_base is None or found.torque_extended is None:
         return ()
-    base, extended = (
-        validate(model, sessions, allow_seen=True, keep_going=True, known=Known()).scores
-        for model in (found.base_model, found.extended_model)
-    )
     return tuple(
         {
             "session": one.session,
@@ -222,7 +216,7 @@ def _torque_errors(found: Diagnosis, sessions: Sequence[Session]) -> tuple[Mappi
                 for side, error in one.relative.items()
             },
         }
-        for one, other in zip(base, extended, strict=True)
+        for one, other in zip(found.torque_base.scores, found.torque_extended.scores, strict=True)
         if all(map(np.isfinite, (*one.relative.values(), *other.relative.values())))
     )
 

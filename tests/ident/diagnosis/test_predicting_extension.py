@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ident.diagnosis import Diagnosis, diagnose
-from ident.diagnosis.extension import TorqueErrors
+from ident.diagnosis.torque_errors import TorqueErrors
 from ident.dynamics.kinematics import Chain
 from ident.estimation.validate import validate
 from ident.model import DynamicModel
+from ident.model.model_file import write_model
 from lwr_driver.session import Session
 
 Make = Callable[..., Session]
@@ -42,6 +45,36 @@ def test_the_torque_errors_are_those_of_validate(logs: tuple[list[Session], Sess
         assert own.sides.tolist() == list(score.relative.values())
         assert own.joints.tolist() == [one.rms for one in score.scores]
     assert extended.left_of(base) < 0.5
+
+
+def test_the_gain_is_what_validate_measures_for_the_written_models(
+    logs: tuple[list[Session], Session], make: Make, chain: Chain, tmp_path: Path
+) -> None:
+    short = make("d.mcap", 6, springs, 3)
+    short = replace(short, phases=[short.phases[0], short.phases[1]._replace(name="return")])
+    test = [logs[1], short]
+    told = diagnose(logs[0], chain, test=test, causes=["cable_spring"])
+    gain = told.to_dict()["gain"]
+    for name, model in (("base", told.base_model), ("extended", told.extended_model)):
+        write_model(model, tmp_path / f"{name}.yaml")
+        found = validate(tmp_path / f"{name}.yaml", test, allow_seen=True).scores
+        assert len({score.scores[0].samples for score in found}) == 2
+        for side in ("motor", "joint"):
+            table = [[s for s in score.scores if s.side == side] for score in found]
+            samples, rms = np.array([[(s.samples, s.rms) for s in row] for row in table]).transpose(2, 0, 1)
+            pooled = np.sqrt(np.sum(samples * rms**2, axis=0) / np.sum(samples, axis=0))
+            np.testing.assert_allclose(gain[f"test_rms_{name}"][side], pooled, rtol=1e-4)
+    np.testing.assert_allclose(gain["rows_extended"]["joint"], told.rms_extended["joint"])
+    assert told.to_dict()["baseline"]["test_rms"] == gain["rows_base"] != gain["test_rms_base"]
+
+
+def test_without_test_sessions_the_gain_is_that_of_the_rows(
+    logs: tuple[list[Session], Session], chain: Chain
+) -> None:
+    told = diagnose(logs[0], chain, causes=["cable_spring"])
+    gain = told.to_dict()["gain"]
+    assert told.torque_rms_base == told.torque_rms_extended == {}
+    assert gain["test_rms_extended"] == gain["rows_extended"]
 
 
 def test_each_joint_is_measured_by_its_own_error() -> None:

@@ -116,6 +116,8 @@ def test_diagnosis_json_keeps_the_contract(done: Done) -> None:
     assert set(found["gain"]) == {
         "test_rms_base",
         "test_rms_extended",
+        "rows_base",
+        "rows_extended",
         "simulation_error_base",
         "simulation_error_extended",
         "simulation",

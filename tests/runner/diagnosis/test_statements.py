@@ -119,6 +119,33 @@ def test_an_extended_model_without_the_causes_and_rows_that_it_worsens_are_named
     assert line.found == "the base model: no cause here lasts and lessens the error of held-out sessions"
 
 
+def test_the_gain_of_test_sessions_has_all_samples_first_and_then_the_rows() -> None:
+    rows = {"rows_base": {"motor": [0.2] * 7}, "rows_extended": {"motor": [0.18] * 7}}
+    content = {
+        **CONTENT,
+        "gain": {**CONTENT["gain"], **rows},
+        "baseline": {"noise_floor": {"motor": [0.1] * 7}},
+    }
+    row = {"side": "motor", "joint": 2, "gain_interval_95": [0.01, 0.03], "avoidable_share": 0.75}
+    said = statements(
+        content, details(rows=[{**row, "test_rms_base": 0.2, "test_rms_extended": 0.18}]), NAMES
+    )
+    gain = next(part for part in said.parts if part.anchor == "gain")
+    told = dict(zip(gain.head, map(str, gain.rows[1]), strict=True))
+    assert list(told.values()) == [
+        "A2 motor", "0.5000", "0.2500", "-50.0", "0.1000", "0.2000", "0.1800", "+0.0100 to +0.0300", "75"
+    ]  # fmt: skip
+    assert list(told)[:5] == ["rms [Nm]", "base", "extended", "change %", "rows: noise"]
+    table = [line for line in said.text().splitlines() if "avoidable %" in line or " motor  " in line]
+    assert len(table) == 8
+    assert max(map(len, table)) <= 115
+    # The figures in short are of all samples.
+    assert "A2 motor -50 %" in said.brief()
+    alone = statements({**content, "sessions": {"train": ["a.mcap"], "test": []}}, details(), NAMES).text()
+    assert "noise [Nm]" in alone
+    assert "rows:" not in alone
+
+
 def test_a_worse_replay_is_pointed_out() -> None:
     line = next(one for one in statements(CONTENT, details(), NAMES).lines if one.anchor == "replay")
     assert line.level == "look"

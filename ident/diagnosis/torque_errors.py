@@ -1,0 +1,68 @@
+"""Torque errors of a model in held-out sessions with all samples, as `validate` measures them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ident.diagnosis.evidence import Floats
+from ident.diagnosis.held_out import FELT_WORSE
+from ident.estimation.identify import Known
+from ident.estimation.scores import SessionScore
+from ident.estimation.validate import validate
+from ident.model import DynamicModel
+from lwr_driver.session import Session
+
+
+class TorqueErrors(NamedTuple):
+    """Errors with all samples, as `validate` measures them: relative ones by session and side, and the rms [Nm] by
+    session, side and joint. scores : of the sessions that have one."""
+
+    sides: Floats
+    joints: Floats
+    scores: tuple[SessionScore, ...] = ()
+
+    @classmethod
+    def of(cls, model: DynamicModel, sessions: Sequence[Session]) -> TorqueErrors:
+        """Of a model in sessions."""
+        scores = validate(model, sessions, allow_seen=True, keep_going=True, known=Known()).scores
+        return cls(
+            np.array([error for score in scores for error in score.relative.values()]),
+            np.array([one.rms for score in scores for one in score.scores]),
+            scores,
+        )
+
+    def left_of(self, base: TorqueErrors) -> float:
+        """Mean square of the joints' errors over those of the base model, each by its own measure: chance in a large
+        one is more than the whole of a small one. Infinite where a side's error is felt to be larger or one is missing,
+        one where the base model has none.
+        """
+        if not np.isfinite(base.joints).any():
+            return 1.0
+        if self.joints.shape != base.joints.shape or np.any(self.sides > (1.0 + FELT_WORSE) * base.sides):
+            return np.inf
+        squares = (self.joints / np.maximum(base.joints, 1e-12)) ** 2
+        return float(np.mean(squares[np.isfinite(squares)]))
+
+    def rms(self) -> dict[str, Floats]:
+        """Rms (n,) [Nm] of each joint by side, pooled over the sessions by their number of samples; a side without a
+        score is missing, a joint without a sample NaN."""
+        power: dict[str, dict[str, Floats]] = {}
+        for one in (one for score in self.scores for one in score.scores):
+            joints = power.setdefault(one.side, {})
+            own = [one.samples * one.rms**2, one.samples] if one.samples else [0.0, 0.0]
+            joints[one.joint] = joints.get(one.joint, np.zeros(2)) + own
+        return {
+            side: np.array([np.sqrt(a / b) if b else np.nan for a, b in joints.values()])
+            for side, joints in power.items()
+        }
+
+
+def errors_of_both(
+    base: DynamicModel, extended: DynamicModel, sessions: Sequence[Session]
+) -> tuple[TorqueErrors, TorqueErrors]:
+    """Errors of base and extended model in sessions, measured once where both are one."""
+    errors = TorqueErrors.of(base, sessions)
+    return errors, errors if extended is base else TorqueErrors.of(extended, sessions)
