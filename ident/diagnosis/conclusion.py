@@ -70,10 +70,17 @@ def conclude(task: Task, state: State) -> Diagnosis:
     ]
     members, after = extension(bench, baseline, members, nuisance, settings.seed)
     told = _told_models(task, state, baseline, members, after)
+    findings = [*findings, *state.timing]
     findings = [contradicted(f) if any(f is r for r in told.refuted) else f for f in findings]
-    doubts += [f for f in findings if not believable(f.grounds)]
-    findings = [f for f in findings if believable(f.grounds)]
-    findings += [*state.timing, *state.loads, *worn]
+
+    def is_character(finding: Finding) -> bool:
+        return task.reference is None and EFFECTS[finding.cause].character
+
+    # What every such drive has stays character where none of the extension is in the model.
+    is_told = [believable(f.grounds) or (told.rejected and is_character(f)) for f in findings]
+    doubts += [f for f, is_one in zip(findings, is_told, strict=True) if not is_one]
+    findings = [f for f, is_one in zip(findings, is_told, strict=True) if is_one]
+    findings += [*state.loads, *worn]
     loss = sample_loss(list(task.sessions))
     if loss:
         findings.append(loss_finding(loss[0]))
@@ -93,13 +100,12 @@ def conclude(task: Task, state: State) -> Diagnosis:
         simulation = task.simulate(task.model or told.base, replayed)
         changed = told.extended.effects != told.base.effects
         extended_simulation = task.simulate(told.extended, replayed) if changed else simulation
-    is_character = {id(f): task.reference is None and EFFECTS[f.cause].character for f in findings}
     return Diagnosis(
         train=tuple(r.name for r in nominal.recordings if not r.test),
         test=tuple(r.name for r in nominal.recordings if r.test),
         model_number=nominal.structure.model,
-        findings=tuple(f for f in findings if not is_character[id(f)]),
-        character=tuple(f for f in findings if is_character[id(f)]),
+        findings=tuple(f for f in findings if not is_character(f)),
+        character=tuple(f for f in findings if is_character(f)),
         doubted=tuple(doubts),
         nameless=told.nameless,
         extension=told.added,
@@ -135,7 +141,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
 class _Told(NamedTuple):
     """The models of the diagnosis. added : what the extended one has more. changes : of its base parameters. before,
     after : held-out rows without and with the extension. refuted : findings with an effect that raises the torque error
-    of the test sessions. errors : of base and extended model there, None without test sessions."""
+    of the test sessions. rejected : whether all of the extension went. errors : of base and extended model in the test
+    sessions, None without any."""
 
     base: DynamicModel
     extended: DynamicModel
@@ -145,6 +152,7 @@ class _Told(NamedTuple):
     before: HeldOut
     after: HeldOut
     refuted: tuple[Finding, ...]
+    rejected: bool
     errors: tuple[TorqueErrors, TorqueErrors] | None
     notes: tuple[str, ...] = ()
 
@@ -164,7 +172,7 @@ def _told_models(
         _, after, made, refuted, errors = without_harm(task, state, baseline, members, after)
     else:
         made = fitted_models(task, state, baseline, members, after)
-    base, extended = made.base, made.extended
+    base, extended, nameless, rejected = made.base, made.extended, made.nameless, False
     before, after = baseline.held.where(after), after.where(baseline.held)
     added = tuple(map(title, made.added))
     if by_identify:
@@ -173,17 +181,23 @@ def _told_models(
         except DataError as error:
             notes = (f"the models are those of the evidence, for `identify` says: {error}",)
         else:
+            own = {title(entry) for entry in base.effects}
+            more = [entry for entry in extended.effects if title(entry) not in own]
             if nominal.held_out:
                 before, after = (left_by(m, nominal, h) for m, h in ((base, before), (extended, after)))
-                errors = errors_of_both(base, extended, task.test)
-                if power_left(before, after) >= 1.0 or errors[1].left_of(errors[0]) > 1.0:
-                    extended, after, errors = base, before, (errors[0], errors[0])
-            own = {title(entry) for entry in base.effects}
-            added = tuple(name for name in map(title, extended.effects) if name not in own)
+                of_base, of_extended = errors_of_both(base, extended, task.test)
+                errors = of_base, of_extended
+                rejected = power_left(before, after) >= 1.0 or of_extended.left_of(of_base) > 1.0
+                if rejected:
+                    gone = {(entry["cause"], tuple(entry["joints"])) for entry in more}
+                    named = [*(m.finding for m in members if m.finding is not None), *state.timing]
+                    refuted = tuple(f for f in named if (f.cause, f.joints) in gone)
+                    extended, after, errors, nameless, more = base, before, (of_base, of_base), (), []
+            added = tuple(map(title, more))
         if task.test and errors is None:
             errors = errors_of_both(base, extended, task.test)
     changes = changes_of(base, extended) if added else {}
-    return _Told(base, extended, added, made.nameless, changes, before, after, refuted, errors, notes)
+    return _Told(base, extended, added, nameless, changes, before, after, refuted, rejected, errors, notes)
 
 
 def _states(nominal: Nominal, side: str, block: Floats) -> RowStates:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import Diagnosis, diagnose
+from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.torque_errors import TorqueErrors
 from ident.dynamics.kinematics import Chain
 from ident.estimation.validate import validate
@@ -108,3 +109,40 @@ def test_an_effect_that_raises_the_torque_error_is_not_in_the_extension(
     assert left[other,] == sure[other,]
     assert left.get((harmful,), 0.0) <= 0.7 < sure[harmful,]
     assert told.rms_extended["joint"][harmful - 1] > 2.0 * told.rms_extended["joint"][other - 1]
+
+
+def three_errors(s: dict) -> None:
+    """Friction of joint 2 by the speed of joint 3, without a name; a hose at joint 3; one-sided friction of joint 1."""
+    s["motor"][:, 1] += 0.5 * np.abs(s["qd"][:, 2]) * np.tanh(5.0 * s["qd"][:, 2] ** 2)
+    s["motor"][:, 0] += 0.5 * np.abs(s["qd"][:, 0])
+    for side in ("motor", "joint"):
+        s[side][:, 2] += 1.2 * s["q"][:, 2]
+
+
+@pytest.mark.parametrize("harmful", [False, True])
+def test_where_no_extension_predicts_better_nothing_says_that_there_is_one(
+    make: Make, chain: Chain, monkeypatch: pytest.MonkeyPatch, harmful: bool
+) -> None:
+    def measured(model: DynamicModel, sessions: Sequence[Session]) -> TorqueErrors:
+        error = np.array([1.0 + (len(model.effects) > 0) * (1.0 if harmful else -0.5)])
+        return TorqueErrors(error, error)
+
+    # As with the drawing of an arm, so that `identify` makes the models.
+    monkeypatch.setattr(Evidence, "drawn", property(lambda self: True))
+    monkeypatch.setattr(TorqueErrors, "of", measured)
+    monkeypatch.setattr("ident.diagnosis.conclusion.believable", lambda grounds: not grounds.get("worse"))
+    logs = [make(f"{k}.mcap", seed, three_errors, k) for k, seed in enumerate((1, 2, 5))]
+    told = diagnose(logs[:2], chain, test=logs[2:], causes=["cable_spring", "friction_asymmetry"])
+    fitted, left = ([(one.side, one.joint) for one in part] for part in (told.nameless, told.unexplained))
+    if not harmful:
+        assert {"cable_spring(3)", "friction_asymmetry(1)"} < set(told.extension)
+        assert ("motor", 2) in fitted
+        assert ("motor", 2) not in left
+        assert not told.doubted
+        return
+    assert (fitted, told.extension) == ([], ())
+    assert told.extended_model is told.base_model
+    assert ("motor", 2) in left
+    # The name of a fault is contradicted; what every such drive has is only not in the model.
+    assert [(f.cause, f.confidence <= 0.7) for f in told.doubted] == [("cable_spring", True)]
+    assert [(f.cause, f.confidence <= 0.7) for f in told.character] == [("friction_asymmetry", True)]
