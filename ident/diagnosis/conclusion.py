@@ -13,7 +13,7 @@ from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, doubted
 from ident.diagnosis.evidence import Floats
 from ident.diagnosis.extension import Member, extension, power_left, title
-from ident.diagnosis.findings import limit_findings, loss_finding
+from ident.diagnosis.findings import in_order, limit_findings, loss_finding
 from ident.diagnosis.held_out import HeldOut, held_out
 from ident.diagnosis.models import changes_of, fitted_models, lasting, without_harm
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
@@ -86,7 +86,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         findings.append(loss_finding(loss[0]))
     findings += limit_findings(nominal.recordings, findings)
     doubts = [d for d in doubts if not any((d.cause, d.joints) == (f.cause, f.joints) for f in findings)]
-    findings.sort(key=lambda f: -f.gain)
+    findings = in_order(sorted(findings, key=lambda f: -f.gain), evidence.floor)
     fitted = {(term.side, term.joint) for term in told.nameless}
     extended_rms = told.after.rms()
     left = [

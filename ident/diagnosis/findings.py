@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.candidates import Trial
-from ident.diagnosis.evidence import Key
+from ident.diagnosis.evidence import Floats, Key
 from ident.diagnosis.held_out import HeldOut, interval
 from ident.diagnosis.intervals import estimated
 from ident.diagnosis.model_form import companions
@@ -105,18 +105,42 @@ def timing_finding(
     days = (task.reference.delay_std_s if task.reference is not None else {}).get(side, DELAY_STD_S)
     std = float(np.hypot(rest[1], days))
     keys = [(side, j) for j in range(arm.chain.n)]
+    rows = tuple((side, j + 1) for side, j in keys)
     rms_before, rms_after, low, high = interval(before, now, keys, task.settings.seed)
     return Finding(
         effect.cause,
         "timing",
         (),
         {"delay": Value((motor if side == "motor" else joint) + rest[0], std, "s")},
-        Evident(-claim.score.fitted, claim.score.p_value, rms_before, rms_after, (low, high)),
+        Evident(-claim.score.fitted, claim.score.p_value, rms_before, rms_after, (low, high), rows),
         claim.confidence,
         tuple((c.cause, c.joints, -g) for c, g in claim.alternatives),
         effect.tell_apart,
         claim.gain,
     )
+
+
+def in_order(findings: Sequence[Finding], floor: Mapping[str, Floats]) -> list[Finding]:
+    """The findings by the share of the avoidable power that each removes in its rows, equal ones as given; those
+    without an error measured in their rows last, the surest first. floor : noise (n,) [Nm] by side.
+    """
+
+    def place(finding: Finding) -> tuple[int, float]:
+        share = _avoidable_removed(finding.evidence, floor)
+        return (1, -finding.confidence) if share is None else (0, -share)
+
+    return sorted(findings, key=place)
+
+
+def _avoidable_removed(shown: Evident, floor: Mapping[str, Floats]) -> float | None:
+    """Share of the power above the noise in its rows that a finding removes, at most 1; None without an error
+    measured."""
+    if not shown.rows or not shown.test_rms_before > 0.0:
+        return None
+    noise = np.mean([floor[side][joint - 1] ** 2 for side, joint in shown.rows])
+    removed = shown.test_rms_before**2 - shown.test_rms_after**2
+    avoidable = shown.test_rms_before**2 - float(noise)
+    return min(removed / avoidable, 1.0) if avoidable > 0.0 else 0.0
 
 
 def loss_finding(worst: SampleLoss) -> Finding:

@@ -124,7 +124,7 @@ def wear(
                     label: Value(float(value), float(s), "1")
                     for label, value, s in zip(labels, share, std, strict=True)
                 },
-                Evident(-square, p_value, before, rms, (before - rms, before - rms)),
+                Evident(-square, p_value, before, rms, (before - rms, before - rms), (("motor", joint + 1),)),
                 sure if heavier and elastic else min(sure, _WORN_OR_WARM),
                 () if heavier else ((FRICTION_TEMPERATURE.cause, (joint + 1,), -square),),
                 _TELL_APART.format(joint=joint + 1),
