@@ -217,6 +217,7 @@ class Diagnosis(Tabular):
     residuals: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict, repr=False)
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
     data: tuple[BrokenChannel, ...] = ()
+    healthy: tuple[Mapping[str, Any], ...] = ()
     torque_base: TorqueErrors | None = None
     torque_extended: TorqueErrors | None = None
 
@@ -291,6 +292,14 @@ class Diagnosis(Tabular):
             "data": [broken.to_dict() for broken in self.data],
             "findings": [finding.to_dict() for finding in self.findings],
             "character": [finding.to_dict() for finding in self.character],
+            "healthy": [
+                {
+                    "cause": entry["cause"],
+                    "joints": list(entry["joints"]),
+                    "parameters": {name: dict(value) for name, value in entry["parameters"].items()},
+                }
+                for entry in self.healthy
+            ],
             "nameless": [term.to_dict() for term in self.nameless],
             "unexplained": [
                 {

@@ -82,6 +82,8 @@ class Part:
         """For the terminal."""
         if self.anchor == "limits":
             return [line for note in self.sentences for line in wrapped(note, "note: ", "      ")]
+        if self.anchor == "healthy":
+            return [line for sentence in self.sentences for line in wrapped(sentence, "", "  ")]
         found: list[Piece] = [self.title]
         for sentence in self.sentences:
             found += wrapped(sentence, "  ", "    ")
@@ -156,6 +158,7 @@ def statements(
     level, headline = _headline(content, details, findings)
     parts = (
         _data(content, names),
+        _healthy(content, names),
         _experiments(details, names),
         _nameless(content, names),
         _unexplained(content, names),
@@ -243,6 +246,16 @@ def _data(content: Plain, names: Sequence[str]) -> Part:
         )
         sentences.append(f"{capital(subject)}: {one['what']}; {one['advice']}")
     return Part("data", "Channels that cannot be what they say", tuple(dict.fromkeys(sentences)))
+
+
+def _healthy(content: Plain, names: Sequence[str]) -> Part:
+    """What the reference has of its own: cause and joints, once each."""
+    joints: dict[str, dict[str, None]] = {}
+    for entry in content.get("healthy", []):
+        own = joints.setdefault(spoken(str(entry["cause"])), {})
+        own.update(dict.fromkeys(_name(joint, names) for joint in entry["joints"]))
+    listed = "; ".join(f"{cause} ({', '.join(own)})" if own else cause for cause, own in joints.items())
+    return Part("healthy", "Healthy arm", [f"The healthy arm has: {listed}."] * bool(listed))
 
 
 def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatement]) -> tuple[Level, str]:

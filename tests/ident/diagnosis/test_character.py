@@ -154,5 +154,11 @@ def test_a_usual_change_of_what_the_healthy_arm_has_is_in_the_models_and_no_find
         now = parameter_values(entry)
         assert now["amplitude"] == pytest.approx(times * own["amplitude"], rel=0.1)
         assert now["velocity"] == own["velocity"]
+        # Beside these sessions' claims the reader sees what commissioning learned.
+        (told,) = found.to_dict()["healthy"]
+        assert (told["cause"], told["joints"]) == ("stribeck", [2])
+        assert told["parameters"]["amplitude"]["value"] == own["amplitude"]
+        assert set(told["parameters"]["amplitude"]) == {"value", "std", "unit"}
+        assert "The healthy arm has: stribeck (two)." in str(found)
     findings = diagnose(sticky(make, 2, 1.2), chain, reference=reference).findings
     assert [(f.cause, f.joints) for f in findings] == [("stribeck", (2,))]

@@ -76,6 +76,7 @@ def test_without_test_sessions_the_gain_is_that_of_the_rows(
     gain = told.to_dict()["gain"]
     assert told.torque_rms_base == told.torque_rms_extended == {}
     assert gain["test_rms_extended"] == gain["rows_extended"]
+    assert told.to_dict()["healthy"] == []
 
 
 def test_each_joint_is_measured_by_its_own_error() -> None:

@@ -105,6 +105,7 @@ def test_diagnosis_json_keeps_the_contract(done: Done) -> None:
         "baseline",
         "findings",
         "character",
+        "healthy",
         "nameless",
         "unexplained",
         "data",

@@ -146,6 +146,25 @@ def test_the_gain_of_test_sessions_has_all_samples_first_and_then_the_rows() -> 
     assert "rows:" not in alone
 
 
+def test_what_the_healthy_arm_has_is_told_in_a_line(tmp_path: Path) -> None:
+    own = [
+        ("stribeck", [2]),
+        ("presliding_hysteresis", [1]),
+        ("presliding_hysteresis", [1]),
+        ("stribeck", [4]),
+    ]
+    healthy = [
+        {"cause": cause, "joints": joints, "parameters": {}} for cause, joints in [*own, ("base_tilt", [])]
+    ]
+    content = {**CONTENT, "healthy": healthy}
+    line = "The healthy arm has: stribeck (A2, A3); presliding hysteresis (A1); base tilt."
+    assert line in statements(content, details(), NAMES).text().splitlines()
+    assert "healthy arm has" not in statements({**content, "healthy": []}, details(), NAMES).text()
+    (tmp_path / "diagnosis.json").write_text(json.dumps(content))
+    (tmp_path / "details.json").write_text(json.dumps(details()))
+    assert line in diagnosis_html(DiagnosisFolder.load(tmp_path))
+
+
 def test_a_worse_replay_is_pointed_out() -> None:
     line = next(one for one in statements(CONTENT, details(), NAMES).lines if one.anchor == "replay")
     assert line.level == "look"
