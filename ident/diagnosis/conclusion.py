@@ -19,7 +19,6 @@ from ident.diagnosis.models import changes_of, fitted_models, lasting, without_h
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
 from ident.diagnosis.payloads import unchecked_masses
 from ident.diagnosis.probes import Remainder, find_remainders
-from ident.diagnosis.reference import Reference
 from ident.diagnosis.refit import left_by, refitted
 from ident.diagnosis.result import Diagnosis, Finding, Nameless, RowStates, Unexplained
 from ident.diagnosis.task import Baseline, State, Task
@@ -127,7 +126,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         simulation_base=simulation,
         simulation_extended=extended_simulation,
         notes=(
-            *_notes(bench, task.reference),
+            *_notes(task, bench, told.before.rms()),
             *_channel_notes(nominal, remainders),
             *state.notes,
             *told.notes,
@@ -233,12 +232,30 @@ def _channel_notes(nominal: Nominal, remainders: Sequence[Remainder]) -> list[st
     return lines + stuck
 
 
-def _notes(bench: DiagnosisBench, reference: Reference | None) -> list[str]:
-    notes, nominal, evidence = [], bench.nominal, bench.evidence
+def _notes(task: Task, bench: DiagnosisBench, measured: Mapping[str, Floats]) -> list[str]:
+    """Limits of the data. measured : rms (n,) [Nm] of the held-out rows by side."""
+    notes, nominal, evidence, reference = [], bench.nominal, bench.evidence, task.reference
     if "motor" not in nominal.rows:
         notes.append(
             "no motor torque: causes on the motor side are invisible, and a sensor error differs from a torque of "
             "the arm by its shape alone"
+        )
+    if "joint" not in nominal.rows:
+        notes.append(
+            "no joint torque: errors of its sensors are invisible, and torques on the links are separated from those "
+            "in the drives by their shape alone"
+        )
+    for side, rms in measured.items():
+        if np.isnan(rms).all():
+            held = bool(nominal.rows[side].valid.any())
+            notes.append(
+                f"no row of the {side} torque is usable{' in the held-out data' if held else ''}: its errors are "
+                f"unknown{' there' if held else ', and causes that it alone shows are invisible'}"
+            )
+    if len(task.everything) == 1:
+        notes.append(
+            "one session: changes from session to session (warm-up, a drifting zero, a payload) are invisible, and "
+            "errors are measured on parts of the one motion"
         )
     if reference is None:
         notes.append(

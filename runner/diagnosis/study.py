@@ -184,7 +184,7 @@ def study(
             simulate=replay,
         )
         pairs, unshown = look_alikes(found, sessions, chain, compare, arm=data, reference=healthy)
-    notes = [*found.notes, *_little(found, everything)]
+    notes = [*found.notes]
     if replay is not None:
         notes += replay.notes
     notes += unshown
@@ -226,21 +226,6 @@ def _first_replay(replay: Replay | None) -> ReplayErrors | None:
         return None
     name = replay.first[0][0]
     return ReplayErrors.of(name, [done for session, done in replay.first if session == name])
-
-
-def _little(diagnosis: Diagnosis, sessions: Sequence[Session]) -> list[str]:
-    notes = []
-    if "joint" not in diagnosis.rms_base:
-        notes.append(
-            "no joint torque: errors of its sensors are invisible, and torques on the links are separated from those "
-            "in the drives by their shape alone"
-        )
-    if len(sessions) == 1:
-        notes.append(
-            "one session: changes from session to session (warm-up, a drifting zero, a payload) are invisible, and "
-            "errors are measured on parts of the one motion"
-        )
-    return notes
 
 
 @contextmanager

@@ -512,7 +512,20 @@ def test_one_session_without_motor_channel(make: Make, chain: Chain) -> None:
     assert found.claims == ()
     assert found.model_number == 1
     assert any("no motor torque" in note for note in found.notes)
+    assert any(note.startswith("one session: changes from session to session") for note in found.notes)
+    assert not any("usable" in note for note in found.notes)
     assert found.to_dict()["baseline"]["test_rms"]["motor"] is None
+
+
+def test_what_no_row_shows_is_told(make: Make, chain: Chain) -> None:
+    alone = [replace(s, joint=replace(s.joint, effort=s.joint.effort[:, :0])) for s in pair(make)]
+    found = diagnose(alone, chain, causes=["stribeck"])
+    assert any(note.startswith("no joint torque: ") for note in found.notes)
+    assert not any(note.startswith("one session") for note in found.notes)
+    found = diagnose(pair(make), chain, test=[replace(make("c.mcap", 9), motor=None)], causes=["stribeck"])
+    assert np.isnan(found.rms_base["motor"]).all()
+    assert any("no row of the motor torque is usable in the held-out data" in note for note in found.notes)
+    assert not any("row of the joint torque" in note for note in found.notes)
 
 
 def test_no_session_is_an_error(chain: Chain) -> None:
