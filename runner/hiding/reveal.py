@@ -129,6 +129,10 @@ class Revelation:
 def hidden_run(folder: Path | None) -> Path:
     """The folder, or the latest of `experiments` with a hidden effect. ConfigurationError without one."""
     if folder is not None:
+        if not folder.is_dir():
+            raise ConfigurationError(
+                f"{folder}: no such folder; name the folder of a run with a hidden effect, or none for the latest"
+            )
         if not (folder / SEALED).is_file():
             raise ConfigurationError(
                 f"{folder}: nothing was hidden in this run; `lwr-run experiment --hide SEED` hides an effect"

@@ -161,6 +161,7 @@ def test_reveal_without_a_hidden_effect_is_refused(tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     assert "no run in `experiments`" in run("experiment", "--reveal").text
     assert "nothing was hidden" in run("experiment", "--reveal", str(tmp_path)).text
+    assert "nosuch: no such folder" in run("experiment", "--reveal", str(tmp_path / "nosuch")).text
     (tmp_path / SEALED).write_text("{}")
     with pytest.raises(DataError, match="run the experiment again"):
         HiddenEffect.unseal(tmp_path)
