@@ -19,6 +19,7 @@ from ident.import_log.conversion import MOST_MISSING, import_log
 from ident.import_log.mapping import LogMapping, Signal, TimeBase, Unit
 from ident.import_log.rests import rests, without_gripper
 from lwr_driver.session import Session, read_session
+from lwr_driver.session.container import MAGIC
 from lwr_driver.session.writer import LIBRARY
 
 logger = logging.getLogger(__name__)
@@ -56,6 +57,11 @@ def read_recording(
             raise ConfigurationError(
                 f"{source}: the joints of a session log were chosen at its import; leave --joints out, or give the "
                 "recording itself"
+            )
+        if source.is_file() and source.suffix != ".mcap" and MAGIC not in _head(source):
+            raise DataError(
+                f"{source}: is no session log; `lwr-run import MAPPING {source} {source.stem}.mcap` makes one of it, "
+                "and `lwr-run identify` guesses the mapping and imports it"
             )
         return read_session(source, status=status)
     mapping = bag_mapping(bag, motor=motor)
@@ -143,5 +149,9 @@ def bag_mapping(bag: Bag, *, motor: bool = False) -> LogMapping:
 
 
 def _ours(path: Path) -> bool:
+    return LIBRARY.split()[0].encode() in _head(path)
+
+
+def _head(path: Path) -> bytes:
     with path.open("rb") as file:
-        return LIBRARY.split()[0].encode() in file.read(_HEAD_BYTES)
+        return file.read(_HEAD_BYTES)

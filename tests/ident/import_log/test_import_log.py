@@ -319,6 +319,21 @@ def test_command_imports_and_reports(tmp_path: Path) -> None:
     assert "mapping.yaml" in session.attachments
 
 
+@pytest.mark.parametrize("command", [["diagnose", "--out", "found"], ["validate", "model.yaml"]])
+def test_other_commands_point_to_the_import_of_a_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("data.csv").write_text("t,q1,tau1\n0,1,2\n")
+    Path("model.yaml").write_text(
+        (CONFIGS.parent / "tests" / "hidden_physics" / "reference.yaml").read_text()
+    )
+    result = CliRunner().invoke(main, [*command, "data.csv"])
+    assert result.exit_code == 7
+    assert "`lwr-run import MAPPING data.csv data.mcap`" in result.output
+    assert not Path("found").exists()
+
+
 @pytest.mark.parametrize("path", sorted((CONFIGS / "imports").glob("*.yaml")), ids=lambda path: path.stem)
 def test_shipped_mappings_parse(path: Path) -> None:
     assert LogMapping.load(path.stem).robot
