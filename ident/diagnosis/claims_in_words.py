@@ -84,10 +84,10 @@ def finding_statement(
 ) -> FindingStatement:
     """A finding in words. both : whether the sessions have both torques."""
     cause, mode, side = str(finding["cause"]), finding.get("mode"), str(finding.get("side", ""))
-    counted = cause in EFFECTS and EFFECTS[cause].counted
+    detail = finding.get("detail")
     meaning = ""
-    if mode and counted:
-        meaning = f"{summary_of(cause)}: {mode}."
+    if detail:
+        meaning = f"{summary_of(cause)}: {detail}."
     elif finding.get("parameters"):
         meaning = f"{summary_of(cause)}: {described(cause, values_of(finding), finding.get('form'), names)}"
         meaning += f", {mode} sessions." if mode else "."
@@ -98,7 +98,7 @@ def finding_statement(
     facts = []
     evidence = finding.get("evidence") or {}
     before, after = evidence.get("test_rms_before"), evidence.get("test_rms_after")
-    if before and after is not None and not (mode and counted):
+    if before and after is not None:
         rows = [f"{joints_text([joint], names)} {side}" for side, joint in evidence.get("rows") or ()]
         label = ", ".join(["error on held-out data", *rows]) if len(rows) == 1 else "error on held-out data"
         low, high = evidence.get("gain_interval_95") or (math.nan, math.nan)

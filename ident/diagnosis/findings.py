@@ -157,7 +157,7 @@ def loss_finding(worst: SampleLoss) -> Finding:
         (),
         LOST_SAMPLES.tell_apart,
         float(worst.amiss),
-        mode=f"{worst.lost} lost, {worst.repeated} repeated and {worst.stale} stale of {count} {worst.channel} "
+        detail=f"{worst.lost} lost, {worst.repeated} repeated and {worst.stale} stale of {count} {worst.channel} "
         f"samples in {worst.session}",
     )
 

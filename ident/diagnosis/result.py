@@ -50,7 +50,7 @@ class Finding:
     """A claim. joints : from 1, empty for the whole arm. mode : `within` or `between` sessions, or None.
 
     alternatives : (cause, joints, delta_bic). gain : fall of the cross-validated chi-square. grounds : of the
-    confidence, see `confidence.Grounds`.
+    confidence, see `confidence.Grounds`. detail : in words, what was counted in the samples.
     """
 
     cause: str
@@ -65,6 +65,7 @@ class Finding:
     mode: str | None = None
     form: str | None = None
     grounds: Mapping[str, float] = field(default_factory=dict)
+    detail: str | None = None
 
     @property
     def values(self) -> dict[str, tuple[float, float, str]]:
@@ -101,6 +102,8 @@ class Finding:
             content["form"] = self.form
         if self.grounds:
             content["grounds"] = dict(self.grounds)
+        if self.detail is not None:
+            content["detail"] = self.detail
         return content
 
     def __str__(self) -> str:

@@ -505,6 +505,10 @@ def test_held_samples_are_seen(make: Make, chain: Chain) -> None:
     lost = [f for f in found.claims if f.cause == "lost_samples"]
     assert lost
     assert lost[0].parameters["share"].value == pytest.approx(len(rows) / len(effort), rel=0.05)
+    # The mode is `within` or `between`, no prose.
+    assert "mode" not in lost[0].to_dict()
+    assert lost[0].detail is not None
+    assert lost[0].detail in " ".join(str(lost[0]).split())
 
 
 def test_one_session_without_motor_channel(make: Make, chain: Chain) -> None:
