@@ -12,7 +12,7 @@ from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, doubted
 from ident.diagnosis.evidence import Floats
-from ident.diagnosis.extension import Member, extension, power_left, title
+from ident.diagnosis.extension import Member, extension, power_left, title, titles
 from ident.diagnosis.findings import in_order, limit_findings, loss_finding
 from ident.diagnosis.held_out import HeldOut, held_out
 from ident.diagnosis.models import changes_of, fitted_models, lasting, without_harm
@@ -174,14 +174,14 @@ def _told_models(
         made = fitted_models(task, state, baseline, members, after)
     base, extended, nameless, rejected = made.base, made.extended, made.nameless, False
     before, after = baseline.held.where(after), after.where(baseline.held)
-    added = tuple(map(title, made.added))
+    added = titles(made.added)
     if by_identify:
         try:
             base, extended = refitted(task, nominal, made.added)
         except DataError as error:
             notes = (f"the models are those of the evidence, for `identify` says: {error}",)
         else:
-            own = {title(entry) for entry in base.effects}
+            own = titles(base.effects)
             more = [entry for entry in extended.effects if title(entry) not in own]
             if nominal.held_out:
                 before, after = (left_by(m, nominal, h) for m, h in ((base, before), (extended, after)))
@@ -193,7 +193,7 @@ def _told_models(
                     named = [*(m.finding for m in members if m.finding is not None), *state.timing]
                     refuted = tuple(f for f in named if (f.cause, f.joints) in gone)
                     extended, after, errors, nameless, more = base, before, (of_base, of_base), (), []
-            added = tuple(map(title, more))
+            added = titles(more)
         if task.test and errors is None:
             errors = errors_of_both(base, extended, task.test)
     changes = changes_of(base, extended) if added else {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,8 @@ from ident.diagnosis.probes import Remainder
 from ident.diagnosis.result import Finding, Nameless
 from ident.diagnosis.task import Baseline
 from ident.effects import NAMELESS, entry_of
+
+_UNNAMED = {effect.cause for effect in NAMELESS.values()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +113,13 @@ def nameless_terms(
 
 
 def title(entry: Mapping[str, Any]) -> str:
-    """An entry of the extended model in short: the cause and its joints."""
+    """An entry of the extended model in short: the cause and its joints, of a term without a name its variable, too."""
     joints = ", ".join(map(str, entry["joints"]))
+    if entry["cause"] in _UNNAMED:
+        joints += f": {str(entry['form']).partition(' ')[0]}"
     return f"{entry['cause']}({joints})" if joints else str(entry["cause"])
+
+
+def titles(entries: Iterable[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Those of entries, once each."""
+    return tuple(dict.fromkeys(map(title, entries)))
