@@ -20,7 +20,7 @@ from ident.diagnosis.tolerances import gain_rows
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling, Side
 from ident.effects import DELAYS, ELASTICITY, PRESLIDING, Shape
-from ident.estimators.physical import cad_prior
+from ident.estimators.physical import cad_prior, lacking_bodies
 
 _BySide = dict[str, Floats]
 _SLOW_S = 0.1
@@ -143,7 +143,7 @@ def _drawn(nominal: Nominal) -> tuple[Floats, Floats]:
     """
     base = nominal.base
     precision, mean = np.zeros((len(base), len(base))), np.zeros(len(base))
-    if base.structure.chain.urdf is not None:
+    if not lacking_bodies(base.structure.chain):
         prior = cad_prior(base).prior("pullback")
         precision, mean = prior.precision.copy(), prior.mean
     for k, name in enumerate(base.names):

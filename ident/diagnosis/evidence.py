@@ -21,6 +21,7 @@ from fri.errors import DataError
 from ident.diagnosis.nominal import Nominal
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.estimators.estimate import chi_square_tail, fisher_tail
+from ident.estimators.physical import lacking_bodies
 from lwr_driver.session.spool import Arena
 
 Floats = NDArray[np.float64]
@@ -286,7 +287,8 @@ class Evidence:
     @property
     def drawn(self) -> bool:
         """Whether the prior is the arm's drawing, and not a healthy arm or the bounds of its friction alone."""
-        return self.prior is not None and not self.compared and self.nominal.structure.chain.urdf is not None
+        known = self.prior is not None and not self.compared
+        return known and not lacking_bodies(self.nominal.structure.chain)
 
     def _fit(
         self, gram: Floats, target: Floats, *, with_prior: bool = True, pulls: Floats | None = None

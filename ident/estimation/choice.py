@@ -47,7 +47,7 @@ from ident.estimation.turning import Turning, friction_turning
 from ident.estimators.covariance import CovarianceSettings, effective_rows
 from ident.estimators.estimate import Estimate, chi_square_tail
 from ident.estimators.least_squares import WeightedLeastSquares
-from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior
+from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior, lacking_bodies
 from ident.estimators.prior import Disagreement, MaximumAPosteriori, Prior
 from ident.estimators.problem import Problem
 from ident.rows.content import Recall
@@ -211,9 +211,9 @@ def choose(
     """
     settings = settings or IdentificationSettings()
     sessions = as_sessions(sessions)
-    prior = chain.urdf is not None and settings.model != 3
-    plain = replace(settings, estimator="map" if prior else "wls", essential=None)
     require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
+    prior = settings.model != 3 and not lacking_bodies(chain)
+    plain = replace(settings, estimator="map" if prior else "wls", essential=None)
     rows = observed(sessions, chain, plain, known=known)
     # With a prior the covariance is the posterior's, whatever the settings.
     first = rows.identified(replace(rows.settings, covariance=_PLAIN) if prior else rows.settings)
@@ -271,15 +271,17 @@ def compared(
     chain, model = found.structure.chain, found.settings.model
     leaning = model != 3 and bool(np.any(chain.gravity)) and tilt is not False
     lean = tilt_columns(found, as_sessions(sessions), recall) if leaning else None
-    bodies = cad_prior(found.base) if chain.urdf is not None and model != 3 else None
+    lacking = lacking_bodies(chain) if model != 3 else ""
+    bodies = cad_prior(found.base) if model != 3 and not lacking else None
     tilted = (False,) if not leaning else (False, True) if tilt is None else (True,)
-    return replace(_Comparison.of(found, lean, bodies).choice(tilted), used=used)
+    return replace(_Comparison.of(found, lean, bodies, lacking).choice(tilted), used=used)
 
 
 @dataclass(frozen=True)
 class _Comparison:
     """Normal equations of the held-back parts: the parameters, two of the tilt, one gain a joint, the torque.
 
+    bodies : the prior of the URDF, None without one; lacking : why there is none.
     further : columns (m, 2 + joints) of the tilt and the gains of `joints` for each group. total : (classes, q, q) of
     all rows. held : (parts, classes, q, q) of the rows of a part. near : the same with the rows beside them, missing in
     the training. sound : whether no channel is in doubt; a wrong one looks like gains of the others' sensors.
@@ -297,11 +299,12 @@ class _Comparison:
     full_rank: bool
     unseen: tuple[str, ...]
     sound: bool
+    lacking: str = ""
     weights: dict[Kind, Floats] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, found: Identification, lean: Sequence[Floats] | None, bodies: BodyPrior | None
+        cls, found: Identification, lean: Sequence[Floats] | None, bodies: BodyPrior | None, lacking: str
     ) -> _Comparison:
         problem, values = found.problem, found.estimate.values
         filters = found.settings.signals
@@ -345,6 +348,7 @@ class _Comparison:
             bool(np.isfinite(found.condition_normalised)),
             found.estimate.prior_only,
             not found.known.doubts,
+            lacking,
         )
 
     def choice(self, tilted: Sequence[bool]) -> Choice:
@@ -353,7 +357,8 @@ class _Comparison:
         unseen = ", ".join(self.unseen[:8]) + (
             f" and {len(self.unseen) - 8} more" if len(self.unseen) > 8 else ""
         )
-        excluded = () if self.full_rank else (f"wls, because the motion does not show {unseen}",)
+        excluded: tuple[str, ...] = (f"physical: {self.lacking}",) if self.lacking else ()
+        excluded += () if self.full_rank else (f"wls, because the motion does not show {unseen}",)
         advice = list(self._placeholder())
         if len(self.held) < 2:
             unknown = Candidate(

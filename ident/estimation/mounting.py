@@ -29,7 +29,7 @@ from ident.effects.link import sideways_gravity
 from ident.estimation.identify import Identification, IdentificationSettings, Known, identify
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Covariance, fisher_tail
-from ident.estimators.physical import cad_prior
+from ident.estimators.physical import cad_prior, lacking_bodies
 from ident.estimators.prior import MaximumAPosteriori, Prior
 from ident.rows.content import Recall
 from ident.rows.observation import observe
@@ -117,7 +117,7 @@ def find_mounting(
     """Tilt of the base of `chain` from the sessions, and the arm identified under it.
 
     sessions, settings, known : as for `identify`. The steps are maximum a posteriori with the inertials of the URDF as
-        prior (`cad_prior`; weighted least squares without a URDF), so that weakly excited parameters do not
+        prior (`cad_prior`; weighted least squares without one), so that weakly excited parameters do not
         absorb the tilt.
     prior_std_rad : standard deviation of the tilt before the data. It hardly matters beside a tenth of a degree
         from the data, and keeps an unexcited angle at zero.
@@ -137,7 +137,7 @@ def find_mounting(
     axes = _axes(chain.gravity)
     tilt = np.zeros(2)
     # The steps need plausible values of all parameters, with any final estimator.
-    inner = replace(settings, essential=None, estimator="wls" if chain.urdf is None else "map")
+    inner = replace(settings, essential=None, estimator="wls" if lacking_bodies(chain) else "map")
     found = identify(sessions, chain, inner, known=known)
     settings = replace(found.settings, essential=settings.essential, estimator=settings.estimator)
     inner = found.settings
@@ -303,7 +303,7 @@ def _prior(found: Identification, tilt: Floats, prior_std_rad: float) -> Prior:
     """The arm's prior with the tilt's: zero for the whole tilt, earlier steps included."""
     p = len(found.base.names)
     mean, precision = np.zeros(p + 2), np.zeros((p + 2, p + 2))
-    if found.structure.chain.urdf is not None:
+    if not lacking_bodies(found.structure.chain):
         arm = cad_prior(found.base).prior("pullback")
         mean[:p], precision[:p, :p] = arm.mean, arm.precision
     mean[p:] = -tilt

@@ -20,6 +20,7 @@ from scipy.linalg import solve_triangular
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.base_set import BaseSet
+from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, from_com, pseudo_inertia, split_name
 from ident.estimators.covariance import CovarianceSettings, effective_rows
 from ident.estimators.estimate import Estimate
@@ -353,7 +354,7 @@ def _conic(curvature: sparse.csc_matrix, linear: Floats, rows: Floats, offset: F
             return np.array(result.x)
     raise DataError(
         f"the physically consistent program ended with {status}; check the prior's masses and the "
-        "parameters' units, or raise `strength`"
+        "parameters' units, or raise `estimator.prior_strength`"
     )
 
 
@@ -454,6 +455,23 @@ _PAYLOAD_STD = 3.0
 _DISSIPATIVE = ("Ia", "Fvl", "Fcl", "Fvm", "Fcm")
 
 
+def lacking_bodies(chain: Chain) -> str:
+    """Why there is no prior of the arm's bodies, in words; empty if the URDF is one."""
+    if chain.urdf is None:
+        return "the chain comes from a table, not from a URDF"
+    bodies = chain.urdf_inertials()
+    names = [name for name, body in zip(chain.link_names, bodies, strict=True) if not body[9] > 0.0]
+    if len(names) == chain.n:
+        return "the URDF states no bodies"
+    if names:
+        return f"the URDF states no mass of {', '.join(names)}"
+    try:
+        nearest_consistent(bodies)
+    except DataError as error:
+        return f"the URDF's bodies are near no rigid ones ({error})"
+    return ""
+
+
 def cad_prior(
     base: BaseSet, *, relative_std: float = 0.2, payload_masses: Mapping[str, float] | None = None
 ) -> BodyPrior:
@@ -462,11 +480,17 @@ def cad_prior(
     payload_masses : stated mass [kg] by payload name; without it a payload is as good as unknown. Inconsistent
         inertials are replaced by the nearest consistent ones.
 
-    Raises ConfigurationError for a chain without URDF and for a structure without rigid bodies (Model 3).
+    Raises ConfigurationError where the URDF is no prior (`lacking_bodies`), and for a structure without rigid bodies
+    (Model 3).
     """
     structure = base.structure
     if "difference" in structure.sides:
         raise ConfigurationError("Model 3 has no rigid bodies and so no prior of them; use `wls`")
+    if lacking := lacking_bodies(structure.chain):
+        raise ConfigurationError(
+            f"{lacking}, so there is no prior for `physical` and `map`; give a URDF with the manufacturer's masses and "
+            "inertias (`<inertial>`), or choose `--estimator wls`"
+        )
     n = structure.chain.n
     masses = payload_masses or {}
     spheres = []

@@ -9,12 +9,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from fri.errors import DataError
+from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
 from ident.estimation.choice import choose
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.parts import PARTS, beside, held_back_parts
 from ident.estimators import MaximumAPosteriori, Prior, Problem, RowGroup, WeightedLeastSquares
+from ident.estimators.physical import lacking_bodies
 from ident.estimators.prior import Disagreement
 from tests.ident.estimation_arm import Sensors, chain, session, true_base
 from tests.ident.regression_problems import design, problem
@@ -161,6 +162,33 @@ def test_a_placeholder_in_the_urdf_loses_and_is_named():
     assert found.choice.disagreement is not None
     assert found.choice.disagreement.p_value < 1e-6
     assert "disagree" in text
+
+
+def test_a_urdf_without_bodies_leaves_least_squares_and_the_reason():
+    text = chain().urdf
+    assert isinstance(text, str)
+    bare = Chain.from_urdf(re.sub(r"<inertial>.*?</inertial>", "", text, flags=re.DOTALL))
+    log = session(sensors=SENSORS, motor=False)
+    found = identify([log], bare, MODEL_1)
+    assert found.choice is not None
+    assert {candidate.estimator for candidate in found.choice.candidates} == {"wls"}
+    assert found.choice.excluded == ("physical: the URDF states no bodies",)
+    for name in ("physical", "map"):
+        with pytest.raises(ConfigurationError, match=r"states no bodies.*<inertial>.*--estimator wls"):
+            identify([log], bare, replace(MODEL_1, estimator=name))
+
+
+def test_a_link_without_mass_is_named_and_leaves_no_prior():
+    text = chain().urdf
+    assert isinstance(text, str)
+    before, mass, after = text.rpartition("<mass value=")
+    light = Chain.from_urdf(before + mass + re.sub(r'"[^"]*"', '"0"', after, count=1))
+    masses = light.urdf_inertials()[:, 9]
+    assert np.count_nonzero(masses == 0.0) == 1
+    name = light.link_names[int(np.argmin(masses))]
+    assert lacking_bodies(light) == f"the URDF states no mass of {name}"
+    assert not lacking_bodies(chain())
+    assert "from a table" in lacking_bodies(replace(chain(), urdf=None))
 
 
 def test_a_weak_motion_is_identified_with_the_prior_and_names_what_it_does_not_show():
