@@ -183,6 +183,11 @@ def _transformed(inertial: ArrayLike, poses: NDArray[np.floating[Any]]) -> Float
     return np.array([parameters.transform(row, pose) for row, pose in zip(rows, poses, strict=True)])
 
 
+# Mass of all links and reach, below and above which masses look like no arm's, and the share of the largest torque that
+# the links' weight has at least, stretched out: 0.5 and more in real arms.
+_LIGHTEST_KG, _REACH_M, _LEAST_LOAD = 1.0, 0.3, 0.02
+
+
 @dataclass(frozen=True, eq=False)
 class Chain(Tabular):
     """A serial arm: n joints, modified-DH constants, gravity.
@@ -406,6 +411,27 @@ class Chain(Tabular):
         urdf = read_urdf(self.urdf)
         stop = set(self.joint_names)
         return self.inertial_from_links([urdf.lumped_inertial(link, stop) for link in self.link_names])
+
+    def placeholder_masses(self) -> str:
+        """Why the masses of the URDF look like no arm's, in words; empty where they may be one's.
+
+        Links of one mass, or together too light for the reach or the torque limits: an arm with that reach weighs more
+        than a kilogramme, and the weight of its links stretched out is more than a fiftieth of its largest torque.
+        Raises ConfigurationError for a chain from a table.
+        """
+        masses = self.urdf_inertials()[:, 9]
+        if not (total := float(masses.sum())) > 0.0:
+            return ""
+        if self.n > 1 and float(np.ptp(masses)) < 1e-6 * float(masses.max()):
+            return f"the URDF gives every link the same mass ({masses[0]:.3g} kg)"
+        reach = float(np.hypot(self.d, self.r).sum())
+        if total < _LIGHTEST_KG and reach > _REACH_M:
+            return f"the URDF gives all links together {total:.3g} kg, for a reach of {reach:.2g} m"
+        efforts = self.efforts()
+        largest = 0.0 if efforts is None else float(efforts[~self.prismatic].max(initial=0.0))
+        if total * float(np.linalg.norm(STANDARD_GRAVITY)) * reach < _LEAST_LOAD * largest:
+            return f"the URDF gives all links together {total:.3g} kg, for torques up to {largest:.4g} Nm"
+        return ""
 
     def to_pinocchio(self, inertial: ArrayLike | None = None) -> Any:
         """pinocchio `Model` in the modified-DH frames; `inertial` (n, 10), default zero.

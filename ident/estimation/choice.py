@@ -282,6 +282,7 @@ class _Comparison:
     """Normal equations of the held-back parts: the parameters, two of the tilt, one gain a joint, the torque.
 
     bodies : the prior of the URDF, None without one; lacking : why there is none.
+    placeholder : why its masses look like no arm's.
     further : columns (m, 2 + joints) of the tilt and the gains of `joints` for each group. total : (classes, q, q) of
     all rows. held : (parts, classes, q, q) of the rows of a part. near : the same with the rows beside them, missing in
     the training. sound : whether no channel is in doubt; a wrong one looks like gains of the others' sensors.
@@ -299,7 +300,8 @@ class _Comparison:
     full_rank: bool
     unseen: tuple[str, ...]
     sound: bool
-    lacking: str = ""
+    lacking: str
+    placeholder: str
     weights: dict[Kind, Floats] = field(default_factory=dict)
 
     @classmethod
@@ -349,6 +351,7 @@ class _Comparison:
             found.estimate.prior_only,
             not found.known.doubts,
             lacking,
+            "" if bodies is None else found.structure.chain.placeholder_masses(),
         )
 
     def choice(self, tilted: Sequence[bool]) -> Choice:
@@ -359,7 +362,12 @@ class _Comparison:
         )
         excluded: tuple[str, ...] = (f"physical: {self.lacking}",) if self.lacking else ()
         excluded += () if self.full_rank else (f"wls, because the motion does not show {unseen}",)
-        advice = list(self._placeholder())
+        advice = list[str]()
+        if self.placeholder:
+            advice.append(
+                f"{self.placeholder}: a placeholder, so its inertials are no knowledge of this arm; give a URDF with "
+                "the manufacturer's inertials, or choose `--estimator wls`"
+            )
         if len(self.held) < 2:
             unknown = Candidate(
                 "physical" if bodies else "wls", 1.0 if bodies else None, tilted[0], (), math.nan, {}
@@ -571,16 +579,6 @@ class _Comparison:
             precision[range(p, p + 2 * tilt), range(p, p + 2 * tilt)] = _TILT_STD_RAD**-2
             mean[:p], precision[:p, :p] = self._completed.mean, self._completed.precision / scale
         return Prior(mean, precision)
-
-    def _placeholder(self) -> Iterator[str]:
-        if self.bodies is None:
-            return
-        masses = self.bodies.inertial[: len(self.bodies.inertial), 9]
-        if len(masses) > 1 and float(np.ptp(masses)) < 1e-6 * float(masses.max()):
-            yield (
-                f"the URDF gives every link the same mass ({masses[0]:.3g} kg): a placeholder, so its inertials are no "
-                "knowledge of this arm; give a URDF with the manufacturer's inertials, or choose `--estimator wls`"
-            )
 
     def _disagreement(self) -> Disagreement | None:
         if self.bodies is None:

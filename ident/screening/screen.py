@@ -240,7 +240,7 @@ def _of_the_wrong_side(one: Explanation) -> Explanation:
         other = bool(np.sum(inertias[1] > 0.0) > np.sum(inertias[0] > 0.0))
     else:
         slopes = [list(_gravity_slopes(d, d.fit()).values()) for d in (data, turned)]
-        if not slopes[0] or not slopes[1]:
+        if not slopes[0] or not slopes[1] or data.chain.placeholder_masses():
             return replace(one, channel="motor torque against joint torque")
         ratios = [abs(float(np.median(values))) for values in slopes]
         other = abs(np.log(ratios[1])) < abs(np.log(ratios[0]))
@@ -425,7 +425,8 @@ def _of_motors(data: Redundancy) -> list[Doubt]:
 def _nominal(data: Redundancy, fit: Fit) -> list[Doubt]:
     """Gravity against the URDF's, in joints with agreement but for a factor.
 
-    Bodies of a URDF are often rough or missing; then they do not correlate, and nothing is said.
+    Bodies of a URDF are often rough or missing; then they do not correlate, and nothing is said. Placeholders may
+    correlate, and say nothing of the torques: they make no error.
     """
     slopes = _gravity_slopes(data, fit)
     if not slopes:
@@ -439,6 +440,9 @@ def _nominal(data: Redundancy, fit: Fit) -> list[Doubt]:
     seen = f"gravity is {middle:.3g} times that of the URDF's bodies"
     mend = "state unit and sign of the torques when importing, or correct the URDF's masses"
     certain = len(slopes) >= _SEVERAL and (middle < 0.0 or abs(np.log(middle)) > 2.0 * np.log(_NOMINAL))
+    if middle > 0.0 and (placeholder := data.chain.placeholder_masses()):
+        looks, certain = f"placeholders: {placeholder}", False
+        mend = "give a URDF with the manufacturer's masses, and look whether the torques are in Nm"
     return [Doubt(channel, names, seen, looks, mend, certain)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -556,6 +557,47 @@ def test_rows_of_a_sensor_dead_in_one_session_are_left_out(pair: list[Session]) 
     kept = without_dead(rows, bad[0])
     assert {group.label for group in rows.groups} - {group.label for group in kept.groups} == {"A4 joint"}
     assert without_dead(rows, pair[0]).groups == rows.groups
+
+
+def with_masses(factor: float) -> Chain:
+    """The arm with all inertials of its URDF times a factor."""
+    text = chain().urdf
+    assert text is not None
+    for name in ("value", "ixx", "ixy", "ixz", "iyy", "iyz", "izz"):
+        tag = "mass" if name == "value" else "inertia"
+        text = re.sub(
+            rf'(<{tag}[^>]*\b{name}=")([^"]*)"', lambda m: f'{m[1]}{factor * float(m[2]):.9g}"', text
+        )
+    return Chain.from_urdf(text)
+
+
+def test_masses_of_no_arm_are_a_warning_and_torques_in_another_unit_an_error(pair: list[Session]) -> None:
+    light = with_masses(2e-3)
+    (found,) = screen(pair, light)
+    assert not found.certain
+    assert "looks like placeholders: the URDF gives all links together 0.0" in str(found)
+    assert "manufacturer's masses" in found.mend
+    assert not chain().placeholder_masses()
+
+    def measured(factor: float) -> list[Session]:
+        return scaled("joint", "effort", factor)(scaled("motor", "effort", factor)(pair))
+
+    assert any(doubt.certain and "mNm" in doubt.looks_like for doubt in screen(measured(1e3), chain()))
+    # The sign says more than the size.
+    assert any(doubt.certain for doubt in screen(measured(-1.0), light))
+
+
+def test_masses_look_like_no_arms_by_their_sameness_the_reach_and_the_torques() -> None:
+    def said(factor: float, lengths: float) -> str:
+        arm = with_masses(factor)
+        return replace(arm, r=lengths * arm.r).placeholder_masses()
+
+    assert "together 0.869 kg, for a reach of 1.1 m" in said(0.05, 1.0)
+    assert not said(0.06, 1.0)
+    # A small arm may be light, yet not beside torques of 176 Nm.
+    assert "for torques up to 176 Nm" in said(0.05, 0.2)
+    same = re.sub(r'<mass value="[^"]*"', '<mass value="2"', chain().urdf or "")
+    assert "every link the same mass (2 kg)" in Chain.from_urdf(same).placeholder_masses()
 
 
 def test_a_message_says_channel_joint_sight_guess_and_remedy() -> None:
