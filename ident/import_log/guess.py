@@ -1,7 +1,7 @@
 """A mapping guessed from the names in a recording, the URDF, and the numbers themselves; for a person to confirm.
 
-Names give the quantities, the URDF the joints. Numbers decide units: positions must keep the limits of the URDF,
-dq/dt must be the velocity, and the median step of the times must lie between 0.1 ms and 0.1 s.
+Names give the quantities, the URDF the joints. Numbers decide units: dq/dt must be the velocity, positions of most
+joints must keep the limits of the URDF, and the median step of the times must lie between 0.1 ms and 0.1 s.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from ident.import_log.turns import unwrapped
 from lwr_driver.configuration import yaml_text
 from lwr_driver.listing import Listing, Piece, text_of
 
+_ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
 _RATES = {"rad/s": 1.0, "deg/s": 180.0 / math.pi, "rpm": 30.0 / math.pi}
 _SHORTEST_S, _LONGEST_S = 1e-4, 0.1
 _RATIO = 1.5
@@ -39,6 +40,8 @@ _UNIX_S = 1e9
 _SLACK = 0.05
 """Share of a joint's range by which positions may exceed it."""
 _TURNS = 4.0 * math.pi
+_WAY = 0.5
+"""Least way of a joint in rad that speaks for rad: in deg it would be at rest."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +139,8 @@ class _Guesser:
                 f"first in row {bad[0]}; at most {100.0 * MOST_MISSING:g} % may be: take other columns, or import "
                 "a part with `lwr-run import --rows`, each with a mapping file"
             )
-        unit, reason = self._angle_unit(position, joints)
-        size = math.pi / 180.0 if unit == "deg" else 1.0
+        unit, reason = self._angle_unit(position, joints, self._best("velocity", joints))
+        size = _ANGLES[unit]
         gripper = False
         if not self.known.joints and self.known.tip is None:
             arm = without_gripper(joints, position.values * size, self.robot, self.known.base)
@@ -223,7 +226,7 @@ class _Guesser:
 
     def _rests(self, position: Field, joints: Sequence[str], unit: str) -> dict[str, float]:
         """Where the recorded joints rest that are no joints of the model, noted in the table."""
-        size = math.pi / 180.0 if unit == "deg" else 1.0
+        size = _ANGLES[unit]
         found = rests(
             self.source,
             position.labels,
@@ -287,36 +290,66 @@ class _Guesser:
         count = position.values.shape[1]
         return self.robot.arm(count=count, root=root), f"the arm of {count} joints in the URDF"
 
-    def _angle_unit(self, position: Field, joints: Sequence[str]) -> tuple[str, str]:
-        """rad or deg, by the name or by the limits of the URDF."""
+    def _angle_unit(
+        self, position: Field, joints: Sequence[str], velocity: Field | None = None
+    ) -> tuple[str, str]:
+        """rad or deg, by the name, by the ratio of velocity to dq/dt, or by the limits of the URDF.
+
+        The ratio tells the unit where the two differ. By the limits most joints decide: one beyond them may have a
+        reversed sign or another zero. It is told, and the screening of the session judges it.
+        """
         words = set(position.words)
         for unit in ("deg", "rad"):
             if words & {unit, f"{unit}ree", f"{unit}ian"}:
                 return unit, "by its name"
         by_name = {joint.name: joint for joint in self.robot.joints}
         limits = np.array([by_name[name].limits or (-math.inf, math.inf) for name in joints])
-        slack = _SLACK * np.nan_to_num(limits[:, 1] - limits[:, 0], posinf=0.0)
         turning = np.array([by_name[name].kind == "revolute" for name in joints])
         known = "the limits of the URDF" if np.isfinite(limits).any() else "two turns"
-        for unit, size in (("rad", 1.0), ("deg", math.pi / 180.0)):
-            values = position.values * size
-            inside = (
-                (values >= limits[:, 0] - slack) & (values <= limits[:, 1] + slack) & (abs(values) < _TURNS)
+        beyond = {unit: _beyond(position.values * size, limits) for unit, size in _ANGLES.items()}
+        unit, reason = "rad", f"{'most joints ' if beyond['rad'].any() else ''}within {known}"
+        if velocity is not None and (ratio := self._ratio(position, velocity)) is not None:
+            unit = "deg" if ratio < 1.0 else "rad"
+            reason = f"{velocity.shown} are {ratio:.3g} times dq/dt"
+        elif _in_degrees(position.values[:, turning], limits[turning], beyond["rad"][turning]):
+            unit, reason = "deg", f"beyond {known} in rad, within them in deg"
+        out = beyond[unit]
+        # Lengths in m beside angles in deg have no unit in common; a mapping's `scale` can tell them apart.
+        if 2 * np.sum(out) >= len(out) or (unit == "deg" and not turning.all()):
+            joint = int(np.argmax(_excess(position.values, limits)))
+            low, high = position.values[:, joint].min(), position.values[:, joint].max()
+            raise DataError(
+                f"{self.source}: {position.shown} runs from {low:.4g} to {high:.4g} at {joints[joint]}, outside the "
+                f"limits {limits[joint, 0]:.4g} to {limits[joint, 1]:.4g} rad in rad and in deg. A motor's angle, or "
+                "another zero or order of joints? Write a mapping file for `lwr-run import` (`transmission`, "
+                "`offset_rad`, `joints`)"
             )
-            # Lengths in m beside angles in deg have no unit in common; a mapping's `scale` can tell them apart.
-            if inside.all() and (unit == "rad" or turning.all()):
-                return (
-                    unit,
-                    f"within {known}" if unit == "rad" else f"beyond {known} in rad, within them in deg",
-                )
-        beyond = position.values - np.clip(position.values, limits[:, 0] - slack, limits[:, 1] + slack)
-        joint = int(np.argmax(np.abs(beyond).max(axis=0)))
-        low, high = position.values[:, joint].min(), position.values[:, joint].max()
-        raise DataError(
-            f"{self.source}: {position.shown} runs from {low:.4g} to {high:.4g} at {joints[joint]}, outside the limits "
-            f"{limits[joint, 0]:.4g} to {limits[joint, 1]:.4g} rad in rad and in deg. A motor's angle, or another zero "
-            "or order of joints? Write a mapping file for `lwr-run import` (`transmission`, `offset_rad`, `joints`)"
-        )
+        if out.any():
+            values = position.values * _ANGLES[unit]
+            listed = ", ".join(
+                f"{joints[k]} ({values[:, k].min():.3g} to {values[:, k].max():.3g} rad, limits "
+                f"{limits[k, 0]:.3g} to {limits[k, 1]:.3g})"
+                for k in np.flatnonzero(out).tolist()
+            )
+            reason += f"; outside its limits: {listed}"
+        return unit, reason
+
+    def _ratio(self, position: Field, velocity: Field) -> float | None:
+        """Velocity over dq/dt in the recorded numbers, where it tells the unit of the positions; else None."""
+        if len(velocity.values) != len(position.values) or not np.isfinite(velocity.values).all():
+            return None
+        times = self._seconds(len(position.values))
+        if times is None:
+            return None
+        rates = compare(position.values, velocity.values, times)
+        # A reversed sign says nothing of the unit.
+        ratios = replace(rates, product=np.abs(rates.product)).by_channel
+        if 2 * np.isfinite(ratios).sum() <= len(ratios):
+            return None
+        ratio = float(np.nanmedian(ratios))
+        degree = _RATES["deg/s"]
+        told = (1.0 / degree, degree, _RATES["rpm"])
+        return ratio if any(abs(math.log(ratio / one)) < math.log(_RATIO) for one in told) else None
 
     def _one_unit(
         self, position: Field, velocity: Field, joints: Sequence[str], rates: Rates, unit: str
@@ -338,7 +371,7 @@ class _Guesser:
         rest = position.of([joints[k] for k in fine]) if set(joints) <= set(position.labels) else None
         rest = rest or replace(position, values=position.values[:, fine])
         of_rest, _ = self._angle_unit(rest, [joints[k] for k in fine])
-        degree = math.pi / 180.0
+        degree = _ANGLES["deg"]
         names = ", ".join(joints[k] for k in odd)
         # What the numbers of the odd joints are to be multiplied with, to be like the others.
         for other, size in (("deg", degree), ("rad", 1.0 / degree)):
@@ -361,11 +394,7 @@ class _Guesser:
         if self.known.rate_hz is not None:
             self.rows.append(("time", "", "", f"{self.known.rate_hz:g} Hz, as given"))
             return TimeBase(rate_hz=self.known.rate_hz), np.arange(count) / self.known.rate_hz
-        clocks = [one for one in self.fields if one.quantity == "time" and len(one.values) == count]
-        clocks = [one for one in clocks if (np.diff(one.values[:, 0]) >= 0).all() and np.ptp(one.values) > 0]
-        if clocks:
-            # Of a date split in two, the finer part.
-            clock = min(clocks, key=lambda one: int(np.sum(np.diff(one.values[:, 0]) == 0)))
+        if (clock := self._clock_of(count)) is not None:
             return self._clock(clock)
         if velocity is not None:
             steps = compare(angle, velocity.values, np.arange(count, dtype=np.float64))
@@ -381,13 +410,29 @@ class _Guesser:
             f"{self.source}: no rising column of times; give the rate of the samples with --rate-hz"
         )
 
+    def _clock_of(self, count: int) -> Field | None:
+        """The column of times of `count` samples; of a date split in two, the finer part."""
+        clocks = [one for one in self.fields if one.quantity == "time" and len(one.values) == count]
+        clocks = [one for one in clocks if (np.diff(one.values[:, 0]) >= 0).all() and np.ptp(one.values) > 0]
+        return min(clocks, key=lambda one: int(np.sum(np.diff(one.values[:, 0]) == 0)), default=None)
+
+    def _seconds(self, count: int) -> Floats | None:
+        """Times (n,) [s] of the samples after the first, None without a clock or a rate."""
+        if self.known.rate_hz is not None:
+            return np.arange(count) / self.known.rate_hz
+        clock = self._clock_of(count)
+        unit = None if clock is None else _unit_of_time(clock.values[:, 0])
+        if clock is None or unit is None:
+            return None
+        times = clock.values[:, 0]
+        seconds = (times - times[0]) * TimeBase(1, unit=unit).seconds
+        # Coarse stamps show the way on average only.
+        return np.linspace(0.0, seconds[-1], count) if (np.diff(times) == 0).any() else seconds
+
     def _clock(self, clock: Field) -> tuple[TimeBase, Floats]:
         times = clock.values[:, 0]
-        step = float(times[-1] - times[0]) / (len(times) - 1)
-        units: tuple[Literal["s", "ms", "us", "ns"], ...] = ("s", "ms", "us", "ns")
-        unit = next(
-            (u for u in units if _SHORTEST_S <= step * TimeBase(1, unit=u).seconds < _LONGEST_S), None
-        )
+        step = _step(times)
+        unit = _unit_of_time(times)
         if unit is None:
             raise DataError(
                 f"{self.source}: the times {clock.shown} are {step:.4g} apart, in no unit a rate from 10 Hz to 10 kHz; "
@@ -406,9 +451,9 @@ class _Guesser:
         why = f"steps of {step:.4g} on average" + (", equal times spread" if equal else "")
         self.used.add(clock.name)
         self.rows.append(("time", clock.shown, unit, why))
-        seconds = (times - times[0]) * base.seconds
-        # Coarse stamps show the way on average only.
-        return found, np.linspace(0.0, seconds[-1], len(seconds)) if equal else seconds
+        seconds = self._seconds(len(times))
+        assert seconds is not None
+        return found, seconds
 
     def _torques(self, joints: Sequence[str]) -> dict[str, Signal]:
         """Signals of the torques and currents."""
@@ -511,6 +556,45 @@ def _whole_rows(found: list[Field]) -> tuple[list[Field], dict[int, NDArray[np.i
         for one in found
     ]
     return left, {len(numbers): numbers for numbers in kept.values()}
+
+
+def _step(times: Floats) -> float:
+    """Mean step of the times (n,), in their unit."""
+    return float(times[-1] - times[0]) / (len(times) - 1)
+
+
+def _unit_of_time(times: Floats) -> Literal["s", "ms", "us", "ns"] | None:
+    """The unit in which the times (n,) are of a rate from 10 Hz to 10 kHz."""
+    units: tuple[Literal["s", "ms", "us", "ns"], ...] = ("s", "ms", "us", "ns")
+    step = _step(times)
+    return next((u for u in units if _SHORTEST_S <= step * TimeBase(1, unit=u).seconds < _LONGEST_S), None)
+
+
+def _excess(angle: Floats, limits: Floats) -> Floats:
+    """How far angles (n, k) leave limits (k, 2) with their slack, at most (k,)."""
+    slack = _SLACK * np.nan_to_num(limits[:, 1] - limits[:, 0], posinf=0.0)
+    past = angle - np.clip(angle, limits[:, 0] - slack, limits[:, 1] + slack)
+    return cast(Floats, np.abs(past).max(axis=0))
+
+
+def _beyond(angle: Floats, limits: Floats) -> NDArray[np.bool_]:
+    """Joints (k,) whose angles (n, k) [rad] leave their limits (k, 2), or go beyond two turns."""
+    return (_excess(angle, limits) > 0.0) | (np.abs(angle).max(axis=0) >= _TURNS)
+
+
+def _in_degrees(numbers: Floats, limits: Floats, beyond: NDArray[np.bool_]) -> bool:
+    """Whether the numbers (n, k) of turning joints, of which some are `beyond` their limits (k, 2) in rad, are degrees.
+
+    With a wrong sign or order a joint keeps the largest limits of the arm. More joints have to be beyond theirs than
+    move within them as joints do in rad, or two of them beyond two turns.
+    """
+    if not beyond.any():
+        return False
+    largest = float(np.abs(limits).max())
+    largest = largest * (1.0 + _SLACK) if math.isfinite(largest) else _TURNS
+    within = ~beyond & (np.ptp(numbers, axis=0) > _WAY)
+    size = np.abs(numbers).max(axis=0)
+    return bool(size.max() > largest and (beyond.sum() > within.sum() or np.sum(size >= _TURNS) > 1))
 
 
 def _rows(count: int) -> str:

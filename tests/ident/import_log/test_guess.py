@@ -358,6 +358,47 @@ def test_a_position_in_another_unit_than_the_others_is_named(joint: int, arm: Pa
         moving(arm, tmp_path, others, QD)
 
 
+@pytest.mark.parametrize("speeds", ["rad/s", "with the positions", "none"])
+@pytest.mark.parametrize(("unit", "size"), [("rad", 1.0), ("deg", DEG)])
+@pytest.mark.parametrize("mistake", ["sign", "order", "zero"])
+def test_most_joints_tell_the_unit_and_one_beyond_its_limits_is_named(
+    mistake: str, unit: str, size: float, speeds: str, arm: Path, tmp_path: Path
+) -> None:
+    # Elbow and third joint bend to one side only.
+    text = arm.read_text()
+    for name, limits in ((JOINTS[3], (-2.9, -0.1)), (JOINTS[1], (-1.0, 1.0))):
+        first, found, rest = text.partition(f'name="{name}"')
+        low, high = limits
+        arm.write_text(
+            first + found + rest.replace('lower="-2.9" upper="2.9"', f'lower="{low}" upper="{high}"', 1)
+        )
+        text = arm.read_text()
+    true = Q.copy()
+    true[:, 3] -= 1.5
+    wrong = true.copy()
+    if mistake == "sign":
+        wrong[:, 3] *= -1.0
+    elif mistake == "order":
+        wrong[:, [1, 3]] = wrong[:, [3, 1]]
+    else:
+        wrong[:, 3] += np.pi
+    names = ["t", *columns("q{k}"), *(columns("dq{k}") if speeds != "none" else []), *columns("tau{k}")]
+    rates = [] if speeds == "none" else [QD * (1.0 if speeds == "rad/s" else size)]
+    for q, odd in ((true, []), (wrong, [3] if mistake != "order" else [1, 3])):
+        guess = guess_mapping(write(tmp_path / "run.csv", names, T, size * q, *rates, TAU), arm)
+        assert guess.mapping.position.unit == unit
+        (row,) = (row for row in guess.rows if row[0] == "position")
+        _, _, outside = row[3].partition("outside its limits: ")
+        assert [name for name in JOINTS if name in outside] == [JOINTS[k] for k in odd]
+
+
+def test_degrees_of_an_arm_that_moves_few_joints_far_are_degrees(arm: Path, tmp_path: Path) -> None:
+    q = np.where(np.isin(PHASE, (1, 3)), DEG, 1.0) * Q
+    names = ["t", *columns("q{k}"), *columns("tau{k}")]
+    guess = guess_mapping(write(tmp_path / "run.csv", names, T, q, TAU), arm)
+    assert guess.mapping.position.unit == "deg"
+
+
 def test_a_velocity_in_another_unit_than_the_others_is_left_out_with_the_reason(
     arm: Path, tmp_path: Path
 ) -> None:
