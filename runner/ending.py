@@ -17,7 +17,7 @@ from ident.estimation.scores import by_side
 from lwr_driver.listing import Piece
 from runner import status
 from runner.report.folder import ResultFolder
-from runner.report.verdicts import Level, Verdict, headline, verdicts
+from runner.report.verdicts import Level, Verdict, estimate_lines, headline, verdicts
 from runner.terminal import verbosity
 
 if TYPE_CHECKING:  # a command imports its own alone
@@ -68,7 +68,7 @@ class Ending:
 
 
 def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Torque error, parameters and payload of a summary, as far as they are there.
+    """Torque error, parameters, estimator and payload of a summary, as far as they are there.
 
     summary : content of summary.json, or `Identification.to_dict()` with `validation`.
     """
@@ -90,6 +90,7 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         rsd = [one["rsd_percent"] for one in listed if one.get("rsd_percent") is not None]
         text += f", median relative std {float(np.median(rsd)):.2g} %" if rsd else ""
         found.append(("parameters", text))
+    found += estimate_lines(summary)
     turning = (summary.get("choice") or {}).get("friction_turns")
     if turning:
         lengths = [1e3 * one for one in turning["length_rad"].values()]

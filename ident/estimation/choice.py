@@ -109,6 +109,7 @@ class Choice(Tabular):
     excluded : candidates that the data do not permit, with the reason. disagreement : between the URDF's inertials
     and the data. advice : sentences for the report. mounting : the tilt of the base, if the winner has one.
     gains : error of the joint torque sensor's scale by joint, value and standard deviation, if the winner has some.
+    urdf_doubt : why the URDF's bodies are missing or look like placeholders, empty without doubt.
     used : the estimator taken instead of the winner; empty for the winner itself. turning : of the drives' friction,
     None where it turns at once.
     """
@@ -124,6 +125,7 @@ class Choice(Tabular):
     gains: dict[str, tuple[float, float]] = field(default_factory=dict)
     used: str = ""
     turning: Turning | None = None
+    urdf_doubt: str = ""
 
     @property
     def winner(self) -> Candidate:
@@ -150,6 +152,7 @@ class Choice(Tabular):
             "excluded": list(self.excluded),
             "prior_disagreement": None if self.disagreement is None else self.disagreement.to_dict(),
             "advice": list(self.advice),
+            "urdf_doubt": self.urdf_doubt,
             "mounting": None if self.mounting is None else self.mounting.to_dict(),
             "sensor_gains": {joint: {"error": e, "std": s} for joint, (e, s) in self.gains.items()},
             "friction_turns": None if self.turning is None else self.turning.to_dict(),
@@ -274,7 +277,9 @@ def compared(
     lacking = lacking_bodies(chain) if model != 3 else ""
     bodies = cad_prior(found.base) if model != 3 and not lacking else None
     tilted = (False,) if not leaning else (False, True) if tilt is None else (True,)
-    return replace(_Comparison.of(found, lean, bodies, lacking).choice(tilted), used=used)
+    comparison = _Comparison.of(found, lean, bodies, lacking)
+    doubt = (chain.urdf is not None and lacking) or comparison.placeholder
+    return replace(comparison.choice(tilted), used=used, urdf_doubt=doubt)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ _LATE_LOOK = 1e-3
 _SLOWEST_S = 2e-3
 _MOVING_LIMIT = 0.05
 _LISTED = 2
+_NAMED = 3
+"""Sessions listed in a verdict, and parameters named in a line."""
 # Torque error of a model that predicts zero.
 _NOTHING = 1.0
 _WITHIN_3_SIGMA = 0.99
@@ -176,6 +178,55 @@ def _unscored(results: ResultFolder) -> Verdict | None:
     return Verdict("sessions without torque error", text, "none", "look", "sessions")
 
 
+def estimate_lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Name and text of what was chosen for an estimate: estimator, gains of sensors, tilt, prior, URDF; as far as
+    there is something to say."""
+    choice: Mapping[str, Any] = summary.get("choice") or {}
+    found = [("estimator", _estimator(choice))] if choice else []
+    gains = choice.get("sensor_gains") or {}
+    if gains:
+        texts = (
+            f"{joint} {100 * one['error']:+.1f} ± {100 * one['std']:.1f} %" for joint, one in gains.items()
+        )
+        found.append(("sensor gains", f"too much by {', '.join(texts)}, stated as effects of the model"))
+    mounting = choice.get("mounting") or summary.get("mounting")
+    if mounting:
+        size, std = math.degrees(math.hypot(*mounting["tilt_rad"])), math.degrees(max(mounting["std_rad"]))
+        found.append(("tilt of the base", f"{size:.2f} ± {std:.2f} deg"))
+    known = list(summary.get("prior_only") or ())
+    if known:
+        more = f" and {len(known) - _NAMED} more" if len(known) > _NAMED else ""
+        parameters = "1 parameter" if len(known) == 1 else f"{len(known)} parameters"
+        found.append(("prior alone", f"tells {parameters}: {', '.join(known[:_NAMED])}{more}"))
+    if choice.get("urdf_doubt"):
+        found.append(("URDF", choice["urdf_doubt"].removeprefix("the URDF ")))
+    return found
+
+
+def _estimator(choice: Mapping[str, Any]) -> str:
+    """The estimator in use with its held-back error, beside the best one and the plain ones."""
+    error = {one["title"]: one["held_back_percent"] for one in choice["candidates"]}
+    best, used = choice["chosen"], choice["used"]
+    if error[best] is None:
+        return f"{used}, not compared: the motion is too short"
+    others = [title for title in dict.fromkeys((best, "wls", "physical")) if title in error and title != used]
+    listed = ", ".join(f"{_short(title)} {error[title]:.2f}" for title in others)
+    text = _short(used) + (f": {error[used]:.2f} % held back" if used in error else "")
+    return text + (f" ({'best: ' if best != used else ''}{listed})" if listed else "")
+
+
+def _short(title: str) -> str:
+    return title.replace("sensor gain of", "gain of")
+
+
+def _estimate(results: ResultFolder) -> Verdict | None:
+    lines = dict(estimate_lines(results.summary))
+    shown = [f"{name} {lines[name]}" for name in ("sensor gains", "tilt of the base") if name in lines]
+    if "estimator" in lines:
+        shown.insert(0, lines["estimator"])
+    return Verdict("estimate", "; ".join(shown), "", "good", "parameters") if shown else None
+
+
 def _assumptions(results: ResultFolder) -> Verdict | None:
     checks: Mapping[str, Any] | None = results.summary.get("assumptions")
     if not checks:
@@ -272,6 +323,7 @@ _QUESTIONS: tuple[Callable[[ResultFolder], Verdict | None], ...] = (
     partial(_torque_error, "torque error (estimate)", False),
     partial(_torque_error, "torque error (held-out motion)", True),
     _unscored,
+    _estimate,
     _assumptions,
     _essential,
     _payload,

@@ -159,6 +159,7 @@ def test_a_placeholder_in_the_urdf_loses_and_is_named():
     assert winner.estimator == "wls" or (winner.prior_scale or 0.0) > 1.0
     text = str(found.choice)
     assert "same mass (1 kg)" in text
+    assert "same mass (1 kg)" in found.choice.urdf_doubt
     assert found.choice.disagreement is not None
     assert found.choice.disagreement.p_value < 1e-6
     assert "disagree" in text
@@ -173,6 +174,7 @@ def test_a_urdf_without_bodies_leaves_least_squares_and_the_reason():
     assert found.choice is not None
     assert {candidate.estimator for candidate in found.choice.candidates} == {"wls"}
     assert found.choice.excluded == ("physical: the URDF states no bodies",)
+    assert found.to_dict()["choice"]["urdf_doubt"] == "the URDF states no bodies"
     for name in ("physical", "map"):
         with pytest.raises(ConfigurationError, match=r"states no bodies.*<inertial>.*--estimator wls"):
             identify([log], bare, replace(MODEL_1, estimator=name))

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from runner.report.folder import ResultFolder
-from runner.report.verdicts import Verdict, verdicts
+from runner.report.verdicts import Verdict, estimate_lines, verdicts
 from runner.results import coverage
 
 SUMMARY: dict[str, Any] = {"exit_status": "success", "sessions": [], "from_logs": True}
@@ -59,6 +59,45 @@ def test_intervals_are_counted_by_kind() -> None:
         "first moments": (2, 2),
         "payload": (1, 2),
     }
+
+
+def candidate(title: str, error: float | None) -> dict[str, Any]:
+    return {"title": title, "held_back_percent": error}
+
+
+LEANING = "physical, base leaning, sensor gain of A5"
+CHOICE: dict[str, Any] = {
+    "chosen": LEANING,
+    "used": LEANING,
+    "candidates": [candidate("physical", 1.346), candidate(LEANING, 1.177), candidate("wls", 1.39)],
+    "sensor_gains": {"A5": {"error": 0.097, "std": 0.009}},
+    "mounting": {"tilt_rad": [0.03, 0.04], "std_rad": [0.001, 0.002]},
+    "urdf_doubt": "the URDF gives every link the same mass (1 kg)",
+}
+
+
+def test_the_estimate_is_named_with_its_error_beside_the_plain_ones_its_gains_and_its_tilt() -> None:
+    assert estimate_lines({"choice": CHOICE, "prior_only": ["XX1", "YY1", "ZZ1", "MX1"]}) == [
+        ("estimator", "physical, base leaning, gain of A5: 1.18 % held back (wls 1.39, physical 1.35)"),
+        ("sensor gains", "too much by A5 +9.7 ± 0.9 %, stated as effects of the model"),
+        ("tilt of the base", "2.86 ± 0.11 deg"),
+        ("prior alone", "tells 4 parameters: XX1, YY1, ZZ1 and 1 more"),
+        ("URDF", "gives every link the same mass (1 kg)"),
+    ]
+    row = verdict("estimate", choice=CHOICE)
+    assert row.level == "good"
+    for text in ("physical, base leaning, gain of A5: 1.18 %", "A5 +9.7", "tilt of the base 2.86 ± 0.11 deg"):
+        assert text in row.found
+
+
+def test_an_estimator_that_stays_is_told_beside_the_best_and_one_without_competitors_so() -> None:
+    (stays, *_) = estimate_lines({"choice": CHOICE | {"used": "wls"}})
+    assert stays[1] == "wls: 1.39 % held back (best: physical, base leaning, gain of A5 1.18, physical 1.35)"
+    alone = {"chosen": "physical", "used": "physical", "candidates": [candidate("physical", None)]}
+    assert estimate_lines({"choice": alone}) == [
+        ("estimator", "physical, not compared: the motion is too short")
+    ]
+    assert estimate_lines({"choice": None, "prior_only": []}) == []
 
 
 def test_sessions_without_a_torque_error_are_looked_at() -> None:
