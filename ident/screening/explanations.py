@@ -47,7 +47,8 @@ class Explanation:
     """A change of a channel: its name, the mended rows, and the fall of the score.
 
     channel : as in `Doubt`. factor : recorded over true value, for a change of scale. gain : of a torque. parts,
-    error : the parts of the data with it, and its size there.
+    error : the parts of the data with it, and its size there. label : number of the session with another payload.
+    alike : the same of other sessions, which explain the data as well.
     """
 
     channel: str
@@ -60,6 +61,7 @@ class Explanation:
     label: str = ""
     error: PartError | None = None
     parts: tuple[Part, ...] = ()
+    alike: tuple[Explanation, ...] = ()
 
 
 def unit_of(factor: float) -> str:
@@ -114,7 +116,15 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
     tried += [scored(candidate)[0] for candidate in _likely(_of_parts(data, fit, normal), normal)]
     tried = [one for one in tried if believed(one, len(normal.classes))]
     best = max(enumerate(tried), key=_rank, default=(0, None))[1]
+    if best is not None and best.channel == "payload":
+        # Of two sessions with one label the one carries more, or the other less.
+        others = {one.label: one for one in reversed(tried) if one.channel == "payload" and _alike(one, best)}
+        return replace(best, alike=tuple(one for label, one in sorted(others.items()) if label != best.label))
     return None if best is None else _refined(best, before, normal)
+
+
+def _alike(one: Explanation, best: Explanation) -> bool:
+    return one.drop > best.drop - _FINER
 
 
 def _rank(numbered: tuple[int, Explanation]) -> tuple[float, bool, int]:
@@ -309,7 +319,8 @@ def _labels(data: Redundancy) -> Iterator[Explanation]:
     if len(records) < 2:
         return
     for record in records:
-        for label in {*labels.values(), None, "another payload"} - {labels[record]}:
+        named = sorted({label for label in labels.values() if label is not None})
+        for label in (label for label in (None, *named, "another payload") if label != labels[record]):
             rows = tuple(replace(p, payload=label) if p.record == record else p for p in data.rows)
             looks = (
                 "no payload" if label is None else f"payload {label!r}" if label in labels.values() else label

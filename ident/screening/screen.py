@@ -26,7 +26,7 @@ from ident.dynamics.structure import Coupling
 from ident.estimators.problem import Problem
 from ident.rows.content import Kept, Recall
 from ident.rows.filters import SignalSettings
-from ident.rows.sessions import payload_name
+from ident.rows.sessions import payload_name, stated_mass
 from ident.screening.channels import check_channels, check_limits, dead
 from ident.screening.doubts import Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, explain, is_wrong, unit_of
@@ -46,6 +46,8 @@ _FACTOR, _LEFT = 2.0, 0.6
 _PART = float(np.log(1.5))
 # A payload acts on all joints: the geometric mean of the residuals falls to a half.
 _LABEL = float(np.log(2.0))
+# Largest deviation of a load from its stated mass.
+_MASS = 0.3
 # Rows for each parameter, below which a fit explains anything.
 _ROWS = 3.0
 # Pass bands tried, over that of the settings: rows see the motion low-passed, and fast motion contradicts itself in a
@@ -196,7 +198,7 @@ def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> tuple[list
     wrong = not agree or any(map(is_wrong, data.gains(fit, normal).values()))
     if wrong or part_errors(data, fit, normal):
         explanations, data = explain(data, _supported)
-        explanations = [_of_the_wrong_side(one) for one in explanations]
+        explanations = [_of_the_wrong_label(_of_the_wrong_side(one), sessions) for one in explanations]
         data = explanations[-1].mended if explanations else data
         found = [_doubt(one, sessions) for one in explanations]
         normal = data.normal()
@@ -251,6 +253,41 @@ def _of_the_wrong_side(one: Explanation) -> Explanation:
     return replace(one, channel=channel, factor=factor, looks_like=unit_of(factor), mended=turned)
 
 
+def _of_the_wrong_label(one: Explanation, sessions: Sequence[Session]) -> Explanation:
+    """Of two sessions with one label that explain the data alike the wrong one, by what more the other carries.
+
+    The heavier one is no bare arm; without the load of the stated mass the lighter one is.
+    """
+    if len(one.alike) != 1:
+        return one
+    choices = {int(each.label): each for each in (one, *one.alike)}
+    first, second = sorted(choices)
+    labels = {payload_name(sessions[record]) for record in choices}
+    more, std = _heavier_by(one.mended, first, second)
+    if len(labels) != 1 or abs(more) < _DEVIATIONS * std:
+        return one
+    heavy, light = (first, second) if more > 0.0 else (second, first)
+    if labels == {None}:
+        return replace(choices[heavy], alike=())
+    stated = stated_mass(sessions[light])
+    if stated and abs(abs(more) / stated - 1.0) < _MASS:
+        return replace(choices[light], alike=())
+    return one
+
+
+def _heavier_by(data: Redundancy, first: int, second: int) -> tuple[float, float]:
+    """By how much one session's payload is heavier than another's [kg], and its standard deviation."""
+    row = np.zeros((1, data.width))
+    for record, sign in ((first, 1.0), (second, -1.0)):
+        payload = next(rows.payload for rows in data.rows if rows.record == record)
+        if payload is not None:
+            place = len(INERTIAL) * (data.chain.n + data.payloads.index(payload)) + INERTIAL.index("M")
+            row[0, place] += sign
+    normal = data.normal()
+    fit = data.fit(normal)
+    return float(row[0] @ fit.parameters), float(data.deviation(fit, normal, row)[0])
+
+
 def _supported(one: Explanation, classes: int) -> bool:
     """Whether an explanation gains enough to be believed."""
     if one.gain is not None:
@@ -282,6 +319,13 @@ def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
         mend = "check this channel there; the mapping of its import mends a known factor (`scale`) or order of columns"
         if one.error is not None and one.error.kind == "drift":
             mend = "leave the session out, or record it with warm electronics"
+    elif channel == "payload" and one.alike:
+        files = [sessions[int(each.label)].path.name for each in (one, *one.alike)]
+        stated = payload_name(sessions[int(one.label)]) or "none"
+        seen = f"one of {', '.join(sorted(files))} carries another payload than its label {stated!r} says; {better}"
+        options = " or ".join(f"`--payload {file}=NAME`" for file in sorted(files))
+        mend = f"name what is mounted in the one with the wrong label ({options}; `none`: the bare arm)"
+        return Doubt(channel, joints, seen, "", mend, certain)
     elif channel == "payload":
         session = sessions[int(one.label)].path.name
         stated = payload_name(sessions[int(one.label)]) or "none"

@@ -114,6 +114,27 @@ def test_a_torque_wrong_in_a_part_of_the_data_is_named_with_it(  # type: ignore[
         assert found.session.startswith(pair[where].path.name)
 
 
+@pytest.mark.parametrize(
+    ("label", "mass", "wrong"),
+    [("none", None, ("loaded",)), ("box", 3.2, ("unloaded",)), ("box", None, ("loaded", "unloaded"))],
+)
+def test_of_two_sessions_with_one_label_the_weight_tells_the_wrong_one_or_both_are_named(
+    label: str, mass: float | None, wrong: tuple[str, ...], pair: list[Session]
+) -> None:
+    # The wrong one may come first or last.
+    for order in (pair, pair[::-1]):
+        bare = [replace(session, motor=None) for session in order]
+        (found,) = doubts(labelled(label, label, mass=mass)(bare))
+        assert (found.channel, found.certain) == ("payload", True)
+        named = {name for name in ("loaded", "unloaded") if f"--payload {name}.mcap=NAME" in found.mend}
+        assert named == set(wrong)
+        assert found.session == (f"{wrong[0]}.mcap" if len(wrong) == 1 else "")
+        if len(wrong) == 2:
+            assert (
+                "one of loaded.mcap, unloaded.mcap carries another payload than its label 'box'" in found.seen
+            )
+
+
 def test_a_torque_that_drifts_in_each_session_is_named_in_all_of_them(pair: list[Session]) -> None:
     (found,) = doubts(drifting(*M, 10.0, "A3")(pair))
     assert (found.channel, found.joints, found.session) == ("motor torque", ("A3",), "all sessions")
