@@ -134,22 +134,33 @@ def _same_arm(urdf: Path, chain: Chain) -> bool:
 
 def agreement(parameters: Sequence[dict[str, Any]], sigmas: float = 3.0) -> float:
     """Share of the estimates within `sigmas` standard deviations of the truth."""
-    known = [entry for entry in parameters if "truth" in entry]
-    inside = [abs(entry["estimate"] - entry["truth"]) <= sigmas * entry["std"] for entry in known]
+    inside = [within(entry, sigmas) for entry in parameters if "truth" in entry]
     return sum(inside) / len(inside) if inside else math.nan
 
 
-def coverage(parameters: Sequence[dict[str, Any]], joints: int) -> dict[str, dict[str, int]]:
-    """By kind of parameter, how many 95 % intervals hold the truth (`inside`) of how many (`count`).
+def within(entry: Mapping[str, Any], sigmas: float = 3.0) -> bool:
+    """Whether a parameter's estimate is within `sigmas` standard deviations of the truth."""
+    return bool(abs(entry["estimate"] - entry["truth"]) <= sigmas * entry["std"])
 
-    parameters : with `truth` and `interval_95`. joints : number of joints; links beyond are payloads.
+
+def interval_holds(entry: Mapping[str, Any]) -> bool:
+    """Whether a parameter's 95 % interval holds the truth."""
+    low, high = entry["interval_95"]
+    return bool(low <= entry["truth"] <= high)
+
+
+def coverage(
+    parameters: Sequence[dict[str, Any]], joints: int, holds: Callable[[Mapping[str, Any]], bool]
+) -> dict[str, dict[str, int]]:
+    """By kind of parameter, of how many (`count`) the truth is where it `holds` (`inside`).
+
+    parameters : with `truth`, and the keys of `holds`. joints : number of joints; links beyond are payloads.
     """
     found: dict[str, dict[str, int]] = {}
     for entry in parameters:
         if "truth" in entry:
             tally = found.setdefault(_kind(entry["name"], joints), {"inside": 0, "count": 0})
-            low, high = entry["interval_95"]
-            tally["inside"] += bool(low <= entry["truth"] <= high)
+            tally["inside"] += holds(entry)
             tally["count"] += 1
     return found
 
@@ -196,8 +207,10 @@ def summarise(
         if entry["name"] in known:
             entry["truth"] = known[entry["name"]]
     if known:
+        n = found.structure.chain.n
         summary["within_3_sigma"] = agreement(summary["parameters"])
-        summary["intervals_95_hold"] = coverage(summary["parameters"], found.structure.chain.n)
+        summary["within_3_sigma_by_kind"] = coverage(summary["parameters"], n, within)
+        summary["intervals_95_hold"] = coverage(summary["parameters"], n, interval_holds)
     return summary
 
 

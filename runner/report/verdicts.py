@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -30,7 +30,7 @@ _WITHIN_3_SIGMA = 0.99
 """Least share within 3 standard deviations; nominal for a normal error: 99.7 %."""
 
 _CHANCE = 0.01
-"""Chance of a false `look` on the 95 % intervals of all kinds together."""
+"""Chance of a false `look` on the 95 % intervals of all kinds together, and on their 3 standard deviations."""
 
 _MASS_TOLERANCE = 0.01
 # Covered by all standard deviations except the textbook's.
@@ -286,25 +286,35 @@ def _truth(results: ResultFolder) -> Verdict | None:
     share = results.summary.get("within_3_sigma")
     if share is None:
         return None
+    near: Mapping[str, Any] = results.summary.get("within_3_sigma_by_kind", {})
     held: Mapping[str, Any] = results.summary.get("intervals_95_hold", {})
-    few = [kind for kind, tally in held.items() if _too_few(tally, len(held))]
+    far, few = _too_few(near, _WITHIN_3_SIGMA), _too_few(held, 0.95)
     text = f"{100 * share:.1f} % of the estimates within 3 standard deviations"
+    if far:
+        text += f" (too few: {_tallies(near, far)})"
     if held:
         inside, count = (sum(tally[key] for tally in held.values()) for key in ("inside", "count"))
         text += f"; {100 * inside / count:.0f} % of the 95 % intervals hold"
-        worst = sorted(few or held, key=lambda kind: held[kind]["inside"] / held[kind]["count"])[:3]
-        tallies = (f"{kind} {held[kind]['inside']} of {held[kind]['count']}" for kind in worst)
-        text += f" ({'too few' if few else 'least'}: {', '.join(tallies)})"
-    good = share >= _WITHIN_3_SIGMA and not few
-    wanted = f"at least {100 * _WITHIN_3_SIGMA:.0f} %; each kind 95 % but for chance"
+        text += f" ({'too few' if few else 'least'}: {_tallies(held, few or held)})"
+    good = share >= _WITHIN_3_SIGMA and not far and not few
+    least = f"{100 * _WITHIN_3_SIGMA:.0f} %"
+    wanted = f"at least {least}, each kind {least} but for chance; each kind 95 % but for chance"
     return Verdict("truth of the emulated arm", text, wanted, "good" if good else "look", "parameters")
 
 
-def _too_few(tally: Mapping[str, int], kinds: int) -> bool:
-    """Whether so few 95 % intervals hold by chance in less than 1 % of all runs, over all kinds (binomial)."""
-    n, inside = tally["count"], tally["inside"]
-    tail = sum(math.comb(n, k) * 0.95**k * 0.05 ** (n - k) for k in range(inside + 1))
-    return tail < _CHANCE / kinds
+def _too_few(tallies: Mapping[str, Mapping[str, int]], share: float) -> list[str]:
+    """Kinds of which so few are inside by chance in less than 1 % of all runs, over all kinds (binomial)."""
+
+    def tail(inside: int, count: int) -> float:
+        return sum(math.comb(count, k) * share**k * (1.0 - share) ** (count - k) for k in range(inside + 1))
+
+    return [kind for kind, tally in tallies.items() if tail(**tally) < _CHANCE / len(tallies)]
+
+
+def _tallies(tallies: Mapping[str, Mapping[str, int]], kinds: Iterable[str]) -> str:
+    """The three kinds with the least inside, and their numbers."""
+    worst = sorted(kinds, key=lambda kind: tallies[kind]["inside"] / tallies[kind]["count"])[:3]
+    return ", ".join(f"{kind} {tallies[kind]['inside']} of {tallies[kind]['count']}" for kind in worst)
 
 
 def _diagnosis(results: ResultFolder) -> Verdict | None:

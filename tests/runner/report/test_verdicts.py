@@ -9,7 +9,7 @@ import pytest
 
 from runner.report.folder import ResultFolder
 from runner.report.verdicts import Verdict, estimate_lines, verdicts
-from runner.results import coverage
+from runner.results import coverage, interval_holds, within
 
 SUMMARY: dict[str, Any] = {"exit_status": "success", "sessions": [], "from_logs": True}
 
@@ -51,7 +51,7 @@ def test_intervals_are_counted_by_kind() -> None:
 
     names = ("Ia1", "Ia2", "Fcm3", "XX2R", "MY4R", "M3R", "ZZ8", "M8")
     entries = [entry(name, 2.0 if name in ("Ia2", "ZZ8") else 0.5) for name in names]
-    found = coverage([*entries, {"name": "offl1"}], joints=7)
+    found = coverage([*entries, {"name": "offl1"}], 7, interval_holds)
     assert {kind: (one["inside"], one["count"]) for kind, one in found.items()} == {
         "Ia": (1, 2),
         "Fcm": (1, 1),
@@ -59,6 +59,23 @@ def test_intervals_are_counted_by_kind() -> None:
         "first moments": (2, 2),
         "payload": (1, 2),
     }
+
+
+def test_estimates_within_3_sigma_are_counted_by_kind_and_a_kind_with_too_few_is_named() -> None:
+    entries = [
+        {"name": f"Fcm{k}", "truth": 1.0, "estimate": 1.0 + (0.31 if k < 3 else 0.29), "std": 0.1}
+        for k in range(1, 8)
+    ]
+    entries += [{"name": f"XX{k}", "truth": 1.0, "estimate": 1.0, "std": 0.1} for k in range(1, 201)]
+    near = coverage(entries, 300, within)
+    assert near == {"Fcm": {"inside": 5, "count": 7}, "inertias": {"inside": 200, "count": 200}}
+    told = verdict("truth of the emulated arm", within_3_sigma=0.9903, within_3_sigma_by_kind=near)
+    assert told.level == "look"
+    assert "99.0 % of the estimates within 3 standard deviations (too few: Fcm 5 of 7)" in told.found
+    near["Fcm"]["inside"] = 6
+    # One of seven is by chance.
+    good = verdict("truth of the emulated arm", within_3_sigma=0.995, within_3_sigma_by_kind=near)
+    assert (good.level, "too few" in good.found) == ("good", False)
 
 
 def candidate(title: str, error: float | None) -> dict[str, Any]:
