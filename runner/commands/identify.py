@@ -134,6 +134,7 @@ def command(
     # Imported on use: the help page needs none of them.
     from ident.dynamics.session_chain import session_chain
     from ident.estimation.identify import identify
+    from ident.estimation.validate import validate
     from ident.model.model_file import write_model
     from runner.ending import of_estimate, of_folder
     from runner.estimation import (
@@ -187,15 +188,15 @@ def command(
     if out is not None:
         write_model(result, out)
     status.show("testing the model")
+    if results is None or as_json:
+        fit = validate(result, logs, allow_seen=True, keep_going=True, known=found.known).to_dict()
+        content |= {"fit": fit["sessions"], "unscored": fit["unscored"]}
     validation = None
     if tested:
-        from ident.estimation.validate import validate
-
         validation = validate(result, tested, keep_going=True)
-    if validation is not None:
         whole = validation.to_dict()
-        content |= {"validation": whole["sessions"], "unscored": whole["unscored"]}
-        content["validation_warnings"] = whole["warnings"]
+        content |= {"validation": whole["sessions"], "validation_warnings": whole["warnings"]}
+        content["unscored"] = [*content.get("unscored", ()), *whole["unscored"]]
         tables += ["", *validation.pieces()]
     page = None
     if results is not None:

@@ -482,6 +482,7 @@ def test_a_failed_test_session_never_costs_the_model(workplace: Callable[[], Pat
     assert code == 7
     assert read_model(place / "m.yaml").value("M8") > 3.0
     assert "payload mass  3." in text
+    assert re.search(r"torque error  .*joint \d\.\d\d % on data of the estimate", text)
     assert "\nM8 " in run("-v", *command, "--force")[1]
     assert "not validated: loaded.mcap: the model was fitted to this session" in " ".join(text.split())
     result = CliRunner().invoke(main, [*command, "--json", "--force"])
@@ -496,7 +497,10 @@ def test_the_payload_of_a_log_can_be_corrected(workplace: Callable[[], Path]) ->
     write_settings(workplace(), essential=None)
     code, text = run("identify", *SESSIONS, *SETTINGS, "--json", "--payload", "loaded.mcap=block:3.3")
     assert code == 0, text
-    assert [session["payload"] for session in json.loads(text)["sessions"]] == [None, "block"]
+    content = json.loads(text)
+    assert [session["payload"] for session in content["sessions"]] == [None, "block"]
+    assert [one["session"] for one in content["fit"]] == list(SESSIONS[:2])
+    assert all(0.0 < one["torque_error"]["joint"] < 0.1 for one in content["fit"])
 
 
 def test_json_of_recover_attach_and_export(workplace: Callable[[], Path]) -> None:

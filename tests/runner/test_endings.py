@@ -39,3 +39,16 @@ def test_delays_in_use_are_told(sessions: list[dict[str, Any]], told: str | None
     # As `Identification.to_dict` has them, and as summary.json.
     for summary in ({"sessions": sessions}, {"sessions": [], "prepared": sessions}):
         assert dict(numbers_of(summary)).get("delay") == told
+
+
+def test_the_torque_error_is_that_of_the_worst_session_and_of_held_out_ones_where_there_are() -> None:
+    fit = [{"torque_error": {"joint": 0.03, "motor": 0.04}}, {"torque_error": {"joint": 0.02, "motor": 0.05}}]
+    held = [{"seen": False, "torque_error": {"joint": 0.06}}]
+    assert (
+        dict(numbers_of({"sessions": [], "fit": fit}))["torque error"]
+        == "joint 2.00 %, motor 5.00 % on data of the estimate"
+    )
+    assert (
+        dict(numbers_of({"sessions": [], "fit": fit, "validation": held}))["torque error"]
+        == "joint 6.00 % on held-out data"
+    )
