@@ -94,8 +94,9 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     turning = (summary.get("choice") or {}).get("friction_turns")
     if turning:
         lengths = [1e3 * one for one in turning["length_rad"].values()]
+        least, most = (f"{float(f'{one:.2g}'):g}" for one in (min(lengths), max(lengths)))
         error = turning["torque_error_percent"]
-        text = f"of {len(lengths)} drives turns over {min(lengths):.2g} to {max(lengths):.2g} mrad, in the model: "
+        text = f"of {len(lengths)} drives turns over {least} to {most} mrad, in the model: "
         text += f"motor torque error of the fit {error['without']:.3g} -> {error['with']:.3g} %"
         found.append(("friction", text))
     late = [text for text in (_delay_of(summary, "motor"), _delay_of(summary, "joint")) if text]

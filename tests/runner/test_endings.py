@@ -52,3 +52,13 @@ def test_the_torque_error_is_that_of_the_worst_session_and_of_held_out_ones_wher
         dict(numbers_of({"sessions": [], "fit": fit, "validation": held}))["torque error"]
         == "joint 6.00 % on held-out data"
     )
+
+
+def test_lengths_of_turning_friction_are_told_without_exponents() -> None:
+    turning = {
+        "length_rad": {"A1": 2.04e-3, "A2": 0.104},
+        "torque_error_percent": {"without": 5.2, "with": 4.9},
+    }
+    choice = {"chosen": "wls", "used": "wls", "candidates": [{"title": "wls", "held_back_percent": 1.0}]}
+    told = dict(numbers_of({"sessions": [], "choice": choice | {"friction_turns": turning}}))["friction"]
+    assert told.startswith("of 2 drives turns over 2 to 100 mrad, in the model: ")
