@@ -294,9 +294,13 @@ def _covariance(rows: tuple[str, ...], entries: tuple[_ParameterEntry, ...], whe
             numbers = np.array([float(part) for part in row.split()])
         except ValueError as error:
             raise ConfigurationError(f"`covariance[{k}]` holds an entry that is no number") from error
-        if numbers.shape != (k + 1,) or not np.all(np.isfinite(numbers)):
+        if len(numbers) != k + 1:
+            raise ConfigurationError(f"`covariance[{k}]` must hold {k + 1} numbers, found {len(numbers)}")
+        if not np.all(np.isfinite(numbers)):
+            bad = int(np.argmin(np.isfinite(numbers)))
             raise ConfigurationError(
-                f"`covariance[{k}]` must hold {k + 1} finite numbers, found {len(numbers)}"
+                f"`covariance[{k}]` of {entries[k].name} with {entries[bad].name} (entry {bad + 1}) is {numbers[bad]}; "
+                "all must be finite: write the model anew, or leave `covariance` and every `std` out"
             )
         lower[k, : k + 1] = numbers
     full = lower + np.tril(lower, -1).T

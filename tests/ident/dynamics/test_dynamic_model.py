@@ -163,7 +163,11 @@ def edited(change) -> dict:
         (lambda c: c["parameters"][0].update(kind="standard"), "exactly one kind"),
         (lambda c: c["parameters"].append(c["parameters"][0]), "appears twice|rows for"),
         (lambda c: c["covariance"].pop(), "rows for"),
-        (lambda c: c["covariance"].__setitem__(1, "1.0"), r"`covariance\[1\]` must hold 2 finite numbers"),
+        (lambda c: c["covariance"].__setitem__(1, "1.0"), r"`covariance\[1\]` must hold 2 numbers, found 1"),
+        (
+            lambda c: c["covariance"].__setitem__(1, "1.0 nan"),
+            r"`covariance\[1\]` of (\w+) with \1 \(entry 2\) is nan",
+        ),
         (lambda c: c["covariance"].__setitem__(1, "1.0 x"), r"`covariance\[1\]` holds an entry"),
         (lambda c: c.pop("conditions"), "`conditions` is missing"),
         (lambda c: c["chain"]["joints"][0].update(alfa=1.0), "unknown key `alfa`; did you mean `alpha`"),
