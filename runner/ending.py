@@ -226,13 +226,19 @@ def of_session(found: SessionSummary) -> Ending:
     ended = None if found.end is None else found.end.get("exit_status", "unknown")
     level: Level = "bad" if ended is None else "good" if ended == "success" else "look"
     how = "the recorder died" if ended is None else f"ended with {ended}"
+    if found.foreign:
+        level, how = "good", found.ended
     sentence = f"{found.duration_s:.1f} s of {data.get('robot', 'an unknown arm')}, {how}."
     numbers = [
         ("payload", found.payload),
         ("recorded", found.recorded),
         ("missing", "; ".join(found.missing) or "nothing"),
     ]
-    next_step = f"lwr-run recover {path}" if ended is None else f"lwr-run identify {path} --out model.yaml"
+    next_step = f"lwr-run identify {path} --out model.yaml"
+    if found.foreign:
+        next_step = f"lwr-run identify {path} --urdf arm.urdf --out model.yaml"
+    elif ended is None:
+        next_step = f"lwr-run recover {path}"
     shown: list[Piece] = [found.topics(), "", found.joints()]
     return Ending(level, sentence, numbers, (), _VERBOSE, next_step, found.pieces(), shown)
 

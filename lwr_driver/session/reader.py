@@ -165,7 +165,7 @@ def _session(
             )
     status, model = fixed["/fri/status"].status(), fixed["/fri/controller_model"].controller_model()
     missing = Missing(
-        ended=end is not None,
+        ended=end is not None or metadata is None,
         closed=scan.closed,
         bytes_unread=scan.bytes_unread,
         lost_from=scan.lost_from,

@@ -194,7 +194,7 @@ def stamp(times: NDArray[np.int64] | int) -> str:
 class Missing:
     """Missing parts of a session; false if it is whole.
 
-    ended : the recorder wrote `session_end`
+    ended : the recorder wrote `session_end`; true for a file of another program, which has none
     closed : the file has its summary and footer
     bytes_unread : bytes behind the last readable record
     lost_from, lost_to : log times of a truncated chunk, if its head is readable [ns]
@@ -239,7 +239,8 @@ class Missing:
 class Session:
     """One motion of the arm with one payload.
 
-    metadata : the record `session`; end : the record `session_end`, None if the recorder died
+    metadata : the record `session`, empty in a file of another program; end : the record `session_end`, None there
+        and if the recorder died
     joint_names : joints of `/joint_states` in its order; the other channels keep this order
     joint : `/joint_states`; motor, command : `/motor_states` and `/joint_command`, None if absent
     phases : beginnings of phases; empty if the whole session is one
@@ -412,6 +413,18 @@ class SessionSummary:
     missing: tuple[str, ...]
 
     @property
+    def ended(self) -> str:
+        """How the recording ended, in words."""
+        if self.foreign:
+            return "recorded by another program"
+        return "unknown: the recorder died" if self.end is None else self.end.get("exit_status", "unknown")
+
+    @property
+    def foreign(self) -> bool:
+        """Whether another program wrote the file: it has neither `session` nor `session_end`."""
+        return self.end is None and not self.metadata
+
+    @property
     def recorded(self) -> str:
         """Time of the first sample, in words."""
         return _clock(self.metadata, self.utc_first)
@@ -423,7 +436,6 @@ class SessionSummary:
     def pieces(self) -> list[Piece]:
         """Origin, topics, joints, phases, and what is missing."""
         data = self.metadata
-        status = "unknown: the recorder died" if self.end is None else self.end.get("exit_status", "unknown")
         reason = f" ({self.end['reason']})" if self.end and self.end.get("reason") else ""
         lines: list[Piece] = [
             f"{self.path}  {self.size_bytes / 1e6:.1f} MB",
@@ -431,7 +443,7 @@ class SessionSummary:
             f"  payload      {self.payload}",
             f"  experiment   {data.get('experiment', '') or '-'}",
             f"  recorded     {self.recorded}, {self.duration_s:.3f} s",
-            f"  ended        {status}{reason}",
+            f"  ended        {self.ended}{reason}",
             f"  motor torque {data.get('motor_torque_source', 'unknown')}",
             "",
             self.topics(),

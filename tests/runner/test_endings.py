@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from runner.ending import numbers_of
+from lwr_driver.session import describe
+from runner.ending import numbers_of, of_session
+from tests.lwr_driver.session.test_reader import plain_messages, ros_session
 
 
 def session(motor: float | None, joint: float | None = None) -> dict[str, Any]:
@@ -62,3 +66,14 @@ def test_lengths_of_turning_friction_are_told_without_exponents() -> None:
     choice = {"chosen": "wls", "used": "wls", "candidates": [{"title": "wls", "held_back_percent": 1.0}]}
     told = dict(numbers_of({"sessions": [], "choice": choice | {"friction_turns": turning}}))["friction"]
     assert told.startswith("of 2 drives turns over 2 to 100 mrad, in the model: ")
+
+
+def test_a_bag_of_another_program_is_identified_and_not_recovered(tmp_path: Path) -> None:
+    ros_session(tmp_path / "bag.mcap", plain_messages(300)[0])
+    found = describe(tmp_path / "bag.mcap")
+    ending = of_session(found)
+    assert (ending.level, "recorded by another program" in ending.sentence) == ("good", True)
+    assert ending.next_step.startswith("lwr-run identify")
+    own = of_session(replace(found, metadata={"robot": "arm"}))
+    assert "the recorder died" in own.sentence
+    assert own.next_step.startswith("lwr-run recover")

@@ -127,7 +127,10 @@ def test_logs_of_another_writer(tmp_path, compression, chunk_size):
     np.testing.assert_array_equal(session.joint.effort, torque)
     assert session.joint.names == ("a", "b", "c")
     assert session.metadata == {}
-    assert not session.missing.ended
+    # Nobody's recorder died.
+    assert session.missing.ended
+    assert "recorder died" not in str(session.missing)
+    assert describe(session).ended == "recorded by another program"
     assert "there is no metadata record `session`" in session.missing.notes
 
 
