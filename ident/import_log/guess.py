@@ -226,11 +226,11 @@ class _Guesser:
 
     def _rests(self, position: Field, joints: Sequence[str], unit: str) -> dict[str, float]:
         """Where the recorded joints rest that are no joints of the model, noted in the table."""
-        size = _ANGLES[unit]
+        prismatic = {joint.name for joint in self.robot.joints if joint.kind == "prismatic"}
         found = rests(
             self.source,
             position.labels,
-            position.values * size,
+            position.values * [1.0 if name in prismatic else _ANGLES[unit] for name in position.labels],
             joints,
             self.robot,
             self.known.base,
@@ -238,8 +238,10 @@ class _Guesser:
         )
         still = tuple(name for name in found.held if name not in found.moving)
         for names, why in ((still, "at rest"), (found.moving, "moves, held at its mean")):
-            if names:
-                self.rows.append(("held", _span(names), "rad", f"{why}, no joint of the model"))
+            for own, measure in ((set(names) - prismatic, "rad"), (set(names) & prismatic, "m")):
+                if own:
+                    listed = _span([name for name in names if name in own])
+                    self.rows.append(("held", listed, measure, f"{why}, no joint of the model"))
         return found.held
 
     def _take(

@@ -196,6 +196,19 @@ def test_extra_columns_of_fingers_are_left_out(arm: Path, tmp_path: Path) -> Non
     np.testing.assert_allclose(read.joint.effort, TAU, rtol=1e-10)
 
 
+@pytest.mark.parametrize("size", [1.0, DEG])
+def test_a_prismatic_finger_is_held_in_metres(size: float, arm: Path, tmp_path: Path) -> None:
+    fingers = [f"panda_finger_joint{k}" for k in (1, 2)]
+    names = ["t", *columns("{joint}_pos"), *(f"{name}_pos" for name in fingers), *columns("{joint}_effort")]
+    open_ = np.full((N, 2), 0.02)
+    path = write(tmp_path / "run.csv", names, T, size * Q, open_, TAU)
+    guess = guess_mapping(path, arm, Known(joints=JOINTS))
+    held = guess.mapping.held
+    assert held
+    assert set(held.values()) == {0.02}
+    assert {row[2] for row in guess.rows if row[0] == "held"} == {"m"}
+
+
 def test_joints_at_rest_are_held_where_they_rest(arm: Path, tmp_path: Path) -> None:
     kept = ("panda_joint2", "panda_joint4")
     moving = np.isin(PHASE, (1, 3))
