@@ -24,24 +24,28 @@ def _words(text: str) -> frozenset[str]:
 
 TEXTS = frozenset({".csv", ".txt", ".dat", ".tsv"})
 QUANTITIES: dict[str, frozenset[str]] = {
-    "acceleration": _words("acceleration acc accel ddq qdd qddot qpp"),
+    "acceleration": _words("acceleration acc accel ddq qdd qddot qpp beschleunigung"),
     "velocity": _words(
-        "velocity vel velocities dq qd qdot qp dth thd dtheta thetad thetadot omega speed qvel jvel"
+        "velocity vel velocities dq qd qdot qp dth thd dtheta thetad thetadot omega speed qvel jvel geschwindigkeit "
+        "drehzahl"
     ),
-    "torque": _words("torque tau effort trq tq moment qfrc jtau"),
-    "position": _words("position pos q th theta angle ang qpos jpos"),
-    "current": _words("current curr cur amp ampere i iq"),
-    "time": _words("time t stamp timestamp clock sec secs seconds ts timestep"),
+    "torque": _words("torque tau effort trq tq moment qfrc jtau drehmoment motormoment"),
+    "position": _words("position pos q th theta angle ang qpos jpos winkel gelenkwinkel achswinkel"),
+    "current": _words("current curr cur amp ampere i iq strom motorstrom"),
+    "time": _words("time t stamp timestamp clock sec secs seconds ts timestep zeit zeitstempel"),
 }
 """Words of each quantity; the first quantity with a word in the name is meant."""
 _ASIDE = _words(
     "cmd command commanded cmptd des desired d target ref reference goal set setpoint model err error ext external "
     "gravity grav g temp temperature est estimated ideal plan planned limit std hat friction coriolis "
+    "soll sollwert temperatur reibung "
     "tcp cartesian cart ee tool flange force pose x y z"
 )
-_SENSED = _words("sm sensor sensed measured meas msr actual act fb feedback real raw")
+_SENSED = _words("sm sensor sensed measured meas msr actual act fb feedback real raw ist istwert")
 _FILTERED = _words("filt filtered filter smooth smoothed lp lowpass")
-_MOTOR = _words("motor mot motors drive actuator")
+_MOTOR = _words("motor mot motors drive actuator motormoment antrieb")
+_AXES = _words("achse gelenk")
+"""German for a joint: `Achse 1 Ist` is its position."""
 _UNITS = {"mnm": r"mN[.·*-]?m(?![A-Za-z])|N[.·*-]?mm(?![A-Za-z])", "ma": r"(?<![A-Za-z])mA(?![A-Za-z])"}
 """Units of two cases, each one word."""
 
@@ -82,6 +86,8 @@ class Field:
             return None
         if words & QUANTITIES["position"] and "dot" in words:
             return "velocity"
+        if words & _AXES and words & _SENSED and words <= _AXES | _SENSED:
+            return "position"
         return next((name for name, known in QUANTITIES.items() if words & known and name != "time"), None)
 
     @property

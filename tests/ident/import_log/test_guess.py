@@ -55,6 +55,7 @@ HABITS: dict[str, tuple[str, str, str, str]] = {
     "joint names": ("stamp", "{joint}_pos", "{joint}_vel", "{joint}_effort"),
     "brackets": ("timestamp_s", "state.q[{k}]", "state.qd[{k}]", "state.tau_J[{k}]"),
     "between": ("time", "joint_{k}_position", "joint_{k}_velocity", "joint_{k}_torque"),
+    "German": ("Zeit", "Achse {k} Ist", "Geschwindigkeit {k}", "Moment {k}"),
     "angles": ("clock", "th_{k}", "thd_{k}", "trq_{k}"),
 }
 
@@ -255,7 +256,9 @@ def test_what_cannot_be_told_is_said(
         ("actual_q_", "position"), ("target_q_", None), ("actual_current_", "current"), ("qDot", "velocity"),
         ("ddq", "acceleration"), ("tau_ext_hat_filtered", None), ("TorqueCur", "torque"),
         ("currentPosition", "position"), ("actual_TCP_speed_", None), ("joint_temperatures", None),
-        ("efforts", "torque"),
+        ("efforts", "torque"), ("Achse  Ist", "position"), ("Achse  Soll", None), ("Moment ", "torque"),
+        ("Achse  Istmoment", None), ("Achse  Ist Drehmoment", "torque"), ("Achse  Strom", "current"),
+        ("Gelenk  Geschwindigkeit", "velocity"), ("Achse ", None),
     ],
 )  # fmt: skip
 def test_words_of_a_name(name: str, quantity: str | None) -> None:
