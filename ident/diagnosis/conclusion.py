@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,12 +14,12 @@ from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, do
 from ident.diagnosis.evidence import Floats
 from ident.diagnosis.extension import Member, extension, power_left, title, titles
 from ident.diagnosis.findings import in_order, limit_findings, loss_finding
-from ident.diagnosis.held_out import HeldOut, held_out
+from ident.diagnosis.held_out import HeldOut, held_out, worse_rows
 from ident.diagnosis.models import changes_of, fitted_models, lasting, without_harm
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
 from ident.diagnosis.payloads import unchecked_masses
 from ident.diagnosis.probes import Remainder, find_remainders
-from ident.diagnosis.refit import left_by, refitted
+from ident.diagnosis.refit import BY_IDENTIFY, left_by, refitted
 from ident.diagnosis.result import Diagnosis, Finding, Nameless, RowStates, Unexplained
 from ident.diagnosis.task import Baseline, State, Task
 from ident.diagnosis.tolerances import GAIN, HABIT, SIZE
@@ -177,27 +177,56 @@ def _told_models(
     added = titles(made.added)
     if by_identify:
         try:
-            base, extended = refitted(task, nominal, made.added)
+            fitted, ways = refitted(task, nominal, made.added)
+            shipped = _shipped(task, nominal, fitted, ways, members, (before, after))
         except DataError as error:
             notes = (f"the models are those of the evidence, for `identify` says: {error}",)
         else:
+            base, (extended, before, after, errors, rejected) = fitted, shipped
             own = titles(base.effects)
             more = [entry for entry in extended.effects if title(entry) not in own]
-            if nominal.held_out:
-                before, after = (left_by(m, nominal, h) for m, h in ((base, before), (extended, after)))
-                of_base, of_extended = errors_of_both(base, extended, task.test)
-                errors = of_base, of_extended
-                rejected = power_left(before, after) >= 1.0 or of_extended.left_of(of_base) > 1.0
-                if rejected:
-                    gone = {(entry["cause"], tuple(entry["joints"])) for entry in more}
-                    named = [*(m.finding for m in members if m.finding is not None), *state.timing]
-                    refuted = tuple(f for f in named if (f.cause, f.joints) in gone)
-                    extended, after, errors, nameless, more = base, before, (of_base, of_base), (), []
+            if rejected and errors is not None:
+                gone = {(entry["cause"], tuple(entry["joints"])) for entry in more}
+                named = [*(m.finding for m in members if m.finding is not None), *state.timing]
+                refuted = tuple(f for f in named if (f.cause, f.joints) in gone)
+                extended, after, errors, nameless, more = base, before, (errors[0], errors[0]), (), []
             added = titles(more)
         if task.test and errors is None:
             errors = errors_of_both(base, extended, task.test)
     changes = changes_of(base, extended) if added else {}
     return _Told(base, extended, added, nameless, changes, before, after, refuted, rejected, errors, notes)
+
+
+def _shipped(
+    task: Task,
+    nominal: Nominal,
+    base: DynamicModel,
+    ways: Iterator[DynamicModel],
+    members: Sequence[Member],
+    held: tuple[HeldOut, HeldOut],
+) -> tuple[DynamicModel, HeldOut, HeldOut, tuple[TorqueErrors, TorqueErrors] | None, bool]:
+    """The first way to the extended model without harm in the held-out rows and sessions, else the last one; the rows
+    with the base model and with it, the errors of both in the sessions, and whether it does harm.
+
+    Harm is no gain over all rows or all samples, or a worse row, see `worse_rows`. held : rows by the evidence.
+    """
+    before, after = held
+    if not nominal.held_out:
+        return next(ways), before, after, None, False
+    own = [m for m in members if m.finding is None or m.finding.cause not in BY_IDENTIFY]
+    acting = {key for member in own for rows in member.rows for key in rows}
+    before, of_base = left_by(base, nominal, before), TorqueErrors.of(base, task.test)
+    for extended in ways:
+        left = left_by(extended, nominal, after)
+        errors = of_base, of_base if extended is base else TorqueErrors.of(extended, task.test)
+        harmful = (
+            power_left(before, left) >= 1.0
+            or errors[1].left_of(of_base) > 1.0
+            or bool(worse_rows(before, left, task.settings.seed, acting))
+        )
+        if not harmful:
+            break
+    return extended, before, left, errors, harmful
 
 
 def _states(nominal: Nominal, side: str, block: Floats) -> RowStates:

@@ -9,7 +9,7 @@ it weighs both against all other parameters.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +23,8 @@ from ident.diagnosis.task import Task
 from ident.dynamics.structure import Side
 from ident.effects import BASE_TILT, SENSOR_GAIN, Column, effects_torque
 from ident.effects.motion import ArmMotion
-from ident.estimation.identify import AUTO, IdentificationSettings, Known, identify
+from ident.estimation.choice import Choice, choose
+from ident.estimation.identify import AUTO, Identification, IdentificationSettings, Known
 from ident.model import DynamicModel
 from ident.rows.prepare import clock_ns
 from lwr_driver.session import JointColumns, Session
@@ -31,24 +32,34 @@ from lwr_driver.session.spool import stored
 
 Entries = tuple[Mapping[str, Any], ...]
 
-# What `identify` looks for by itself, see `ident.estimation.choice`.
-_BY_IDENTIFY = (BASE_TILT.cause, SENSOR_GAIN.cause)
+BY_IDENTIFY = (BASE_TILT.cause, SENSOR_GAIN.cause)
+"""Causes that `identify` looks for by itself, see `ident.estimation.choice`."""
 
 
-def refitted(task: Task, nominal: Nominal, effects: Entries) -> tuple[DynamicModel, DynamicModel]:
-    """Base model, and extended model with `effects`, by `identify`'s own choice of the estimator.
+def refitted(task: Task, nominal: Nominal, effects: Entries) -> tuple[DynamicModel, Iterator[DynamicModel]]:
+    """Base model by `identify`'s own choice of the estimator, and ways to the extended model with `effects`: by the
+    same choice, for another prior or tilt changes the rows of all joints, then by a choice of its own.
 
     Raises DataError for sessions that `identify` refuses.
     """
     base = _identified(task, nominal, task.sessions)
-    effects = tuple(e for e in effects if e["cause"] not in _BY_IDENTIFY)
+    effects = tuple(e for e in effects if e["cause"] not in BY_IDENTIFY)
+    return base.model, _extended(task, nominal, base, effects)
+
+
+def _extended(task: Task, nominal: Nominal, base: Identification, effects: Entries) -> Iterator[DynamicModel]:
     if not effects:
-        return base, base
-    extended = _identified(task, nominal, _without(task, nominal, effects))
-    return base, replace(extended, effects=(*extended.effects, *effects))
+        yield base.model
+        return
+    sessions = _without(task, nominal, effects)
+    for like in (base.choice, None):
+        found = _identified(task, nominal, sessions, like).model
+        yield replace(found, effects=(*found.effects, *effects))
 
 
-def _identified(task: Task, nominal: Nominal, sessions: Sequence[Session]) -> DynamicModel:
+def _identified(
+    task: Task, nominal: Nominal, sessions: Sequence[Session], like: Choice | None = None
+) -> Identification:
     structure = nominal.structure
     settings = IdentificationSettings(
         model=structure.model,
@@ -61,7 +72,7 @@ def _identified(task: Task, nominal: Nominal, sessions: Sequence[Session]) -> Dy
         essential=None,
     )
     chosen = Known(signal_reasons=("signal settings of the diagnosis",))
-    return identify(sessions, structure.chain, settings, known=chosen).model
+    return choose(sessions, structure.chain, settings, known=chosen, like=like)
 
 
 def _without(task: Task, nominal: Nominal, effects: Entries) -> list[Session]:

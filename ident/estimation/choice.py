@@ -205,10 +205,12 @@ def choose(
     *,
     tilt: bool | None = None,
     known: Known | None = None,
+    like: Choice | None = None,
 ) -> Identification:
     """The arm identified by the candidate with the least held-back error; arguments as for `identify`.
 
-    tilt : True scores the leaning base only, False the upright one, None both.
+    tilt : True scores the leaning base only, False the upright one, None both. like : an earlier choice for such
+    sessions, taken instead of a comparison.
 
     The result's `choice` says what was compared. Raises the errors of `identify`.
     """
@@ -220,7 +222,7 @@ def choose(
     rows = observed(sessions, chain, plain, known=known)
     # With a prior the covariance is the posterior's, whatever the settings.
     first = rows.identified(replace(rows.settings, covariance=_PLAIN) if prior else rows.settings)
-    choice = compared(first, sessions, tilt=tilt, recall=rows.recall)
+    choice = compared(first, sessions, tilt=tilt, recall=rows.recall) if like is None else _again(like)
     winner = choice.winner
     options: dict[str, Any] = {"prior_strength": winner.prior_scale} if winner.estimator == "physical" else {}
     settled = replace(
@@ -248,6 +250,11 @@ def choose(
     apart = choice.disagreement
     warnings = (*found.warnings, str(apart)) if apart is not None and apart.strong else found.warnings
     return replace(found, settings=settled, choice=choice, effects=effects, warnings=warnings)
+
+
+def _again(choice: Choice) -> Choice:
+    """A choice for other sessions, without what was estimated from the first ones."""
+    return replace(choice, mounting=None, turning=None)
 
 
 def _calibrated(session: Session, gains: Mapping[str, tuple[float, float]]) -> Session:

@@ -101,6 +101,17 @@ def test_a_tilt_is_found_where_it_helps():
     assert not any(candidate.tilt for candidate in upright.choice.candidates)
 
 
+def test_an_earlier_choice_is_taken_for_other_sessions_and_estimates_anew(monkeypatch: pytest.MonkeyPatch):
+    first = chosen(kilogrammes=4.0).choice
+    assert first is not None
+    monkeypatch.setattr("ident.estimation.choice.compared", None)
+    again = choose([session(sensors=SENSORS, motor=False, seed=7)], chain(), MODEL_1, like=first)
+    assert again.choice is not None
+    assert again.choice.winner == first.winner
+    assert again.choice.used == first.used
+    assert not np.array_equal(again.model.values, chosen(kilogrammes=4.0).model.values)
+
+
 def test_a_sensor_that_reads_too_much_is_found_and_stated_as_an_effect():
     log = session(sensors=SENSORS, motor=False, periods=3)
     effort = log.joint.effort.copy()
