@@ -121,26 +121,25 @@ def timing_finding(
 
 
 def in_order(findings: Sequence[Finding], floor: Mapping[str, Floats]) -> list[Finding]:
-    """The findings by the share of the avoidable power that each removes in its rows, equal ones as given; those
-    without an error measured in their rows last, the surest first. floor : noise (n,) [Nm] by side.
+    """The findings by the power that each removes in its rows, in units of their noise, equal ones as given; those
+    without an error measured in their rows before the first with a smaller gain. floor : noise (n,) [Nm] by side.
     """
+    powers = [(finding, _removed(finding.evidence, floor)) for finding in findings]
+    measured = [(finding, power) for finding, power in powers if power is not None]
+    ordered = [finding for finding, _ in sorted(measured, key=lambda pair: -pair[1])]
+    others = [finding for finding, power in powers if power is None]
+    for finding in sorted(others, key=lambda one: -one.gain):
+        places = (place for place, one in enumerate(ordered) if one.gain < finding.gain)
+        ordered.insert(next(places, len(ordered)), finding)
+    return ordered
 
-    def place(finding: Finding) -> tuple[int, float]:
-        share = _avoidable_removed(finding.evidence, floor)
-        return (1, -finding.confidence) if share is None else (0, -share)
 
-    return sorted(findings, key=place)
-
-
-def _avoidable_removed(shown: Evident, floor: Mapping[str, Floats]) -> float | None:
-    """Share of the power above the noise in its rows that a finding removes, at most 1; None without an error
-    measured."""
+def _removed(shown: Evident, floor: Mapping[str, Floats]) -> float | None:
+    """Power that a finding removes over that of the noise, sum over its rows; None without an error measured."""
     if not shown.rows or not shown.test_rms_before > 0.0:
         return None
-    noise = np.mean([floor[side][joint - 1] ** 2 for side, joint in shown.rows])
-    removed = shown.test_rms_before**2 - shown.test_rms_after**2
-    avoidable = shown.test_rms_before**2 - float(noise)
-    return min(removed / avoidable, 1.0) if avoidable > 0.0 else 0.0
+    noise = float(np.mean([floor[side][joint - 1] ** 2 for side, joint in shown.rows]))
+    return len(shown.rows) * (shown.test_rms_before**2 - shown.test_rms_after**2) / max(noise, 1e-300)
 
 
 def loss_finding(worst: SampleLoss) -> Finding:

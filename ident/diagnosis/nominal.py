@@ -582,17 +582,21 @@ class Nominal:
         return np.stack([self._slow(side, table, width * usual_step(stamp)) for table in wide])[:, chosen]
 
     def _moves(self, stretch: RecordStretch, speed: Floats, at: Floats) -> NDArray[np.bool_]:
-        """Whether joints move in one direction for a while before and after times (m,), (m, n)."""
+        """Whether joints move in one direction for a while before and after times (m,), away from rest, (m, n)."""
         dt = float(stretch.time[1] - stretch.time[0])
         least = self.settings.standstill_rad_s
+        size = 2 * round(self.settings.reversal_s / dt) + 1
         # The low-pass of the positions spreads a start or a stop by half a period of its cut-off to either side.
-        size = 2 * round(max(self.settings.reversal_s, 0.5 / self.settings.signals.cutoff) / dt) + 1
+        wide = 2 * round(0.5 / self.settings.signals.cutoff / dt) + 1
         found = np.empty((len(at), speed.shape[1]), dtype=bool)
         for joint in range(speed.shape[1]):
             # One joint of a long session at a time.
             own = column(speed, joint)
-            steady = (minimum_filter1d(own, size) > least) | (maximum_filter1d(own, size) < -least)
-            found[:, joint] = _at(stretch.time, steady[:, None].astype(float), at)[:, 0] > 0.999
+            steady = (minimum_filter1d(own, size) > 0.0) | (maximum_filter1d(own, size) < 0.0)
+            rests = maximum_filter1d(np.abs(own), wide) <= least
+            steady &= ~maximum_filter1d(rests, 2 * wide - 1)
+            moves = np.abs(_at(stretch.time, own[:, None], at)) > least
+            found[:, joint] = (moves & (_at(stretch.time, steady[:, None].astype(float), at) > 0.999))[:, 0]
         return found
 
     def _matrix(

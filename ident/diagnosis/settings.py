@@ -25,8 +25,8 @@ class DiagnosisSettings:
         they are estimated from, None for the same.
     deflection_hz : low-pass on the torque for the joints' twist.
     standstill_rad_s : rows of a joint below this speed are left out, for their friction is unknown.
-    reversal_s : rows this close to a slower one are left out: the motor may reverse later, and the filtered speed of a
-        start or a stop is none of the joint. At least half a period of the positions' cut-off.
+    reversal_s : rows this close to a reversal are left out: the motor may reverse later. So are those within half a
+        period of the positions' cut-off beside rest: the filtered speed of a start or a stop is none of the joint.
     guard_s : joint rows this close to a joint's standstill are left out too.
     block_s : length of the blocks with independent errors, also for cross-validation.
     folds : number of parts of the motion in cross-validation.
