@@ -169,7 +169,7 @@ def _told_models(
     notes: tuple[str, ...] = ()
     by_identify = task.sound and state.bench.evidence.drawn
     if task.test and not by_identify:
-        _, after, made, refuted, errors = without_harm(task, state, baseline, members, after)
+        after, made, refuted, errors = without_harm(task, state, baseline, members, after)
     else:
         made = fitted_models(task, state, baseline, members, after)
     base, extended, nameless, rejected = made.base, made.extended, made.nameless, False

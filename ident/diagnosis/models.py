@@ -140,10 +140,9 @@ def turning_friction(
 
 
 class Harmless(NamedTuple):
-    """Members of the extension, the held-out rows and the models with them, the findings that went, and the errors of
-    base and extended model in the held-out sessions."""
+    """Held-out rows and models with the members of the extension that are left, the findings that went, and the errors
+    of base and extended model in the held-out sessions."""
 
-    members: list[Member]
     after: HeldOut
     made: Models
     refuted: tuple[Finding, ...]
@@ -172,7 +171,7 @@ def without_harm(
         members = [m for m in members if m is not worst]
         refuted += [worst.finding] if worst.finding is not None else []
         held_out_with(bench, members, nuisance)
-    return Harmless(members, after, made, tuple(refuted), (base, errors))
+    return Harmless(after, made, tuple(refuted), (base, errors))
 
 
 def changes_of(base: DynamicModel, extended: DynamicModel) -> dict[str, float]:

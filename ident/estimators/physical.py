@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import ClassVar, Literal
 
 import clarabel
@@ -455,6 +455,8 @@ _PAYLOAD_STD = 3.0
 _DISSIPATIVE = ("Ia", "Fvl", "Fcl", "Fvm", "Fcm")
 
 
+# The nearest rigid bodies are a convex program, and every fit of a diagnosis asks.
+@lru_cache(maxsize=16)
 def lacking_bodies(chain: Chain) -> str:
     """Why there is no prior of the arm's bodies, in words; empty if the URDF is one."""
     if chain.urdf is None:

@@ -184,7 +184,7 @@ def study(
             simulate=replay,
         )
         pairs, unshown = look_alikes(found, sessions, chain, compare, arm=data, reference=healthy)
-    notes = [*found.notes]
+    notes = list(found.notes)
     if replay is not None:
         notes += replay.notes
     notes += unshown
