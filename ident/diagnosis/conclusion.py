@@ -19,7 +19,7 @@ from ident.diagnosis.models import changes_of, fitted_models, lasting, without_h
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
 from ident.diagnosis.payloads import unchecked_masses
 from ident.diagnosis.probes import Remainder, find_remainders
-from ident.diagnosis.refit import BY_IDENTIFY, left_by, refitted
+from ident.diagnosis.refit import BY_IDENTIFY, Entries, left_by, refitted
 from ident.diagnosis.result import Diagnosis, Finding, Nameless, RowStates, Unexplained
 from ident.diagnosis.task import Baseline, State, Task
 from ident.diagnosis.tolerances import GAIN, HABIT, SIZE
@@ -120,7 +120,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         rms_extended=extended_rms,
         base_model=told.base,
         extended_model=told.extended,
-        changes=told.changes,
+        changes=changes_of(told.base, told.extended) if told.added else {},
         scores=state.selection.scores,
         nuisance=state.selection.nuisance,
         simulation_base=simulation,
@@ -139,16 +139,14 @@ def conclude(task: Task, state: State) -> Diagnosis:
 
 
 class _Told(NamedTuple):
-    """The models of the diagnosis. added : what the extended one has more. changes : of its base parameters. before,
-    after : held-out rows without and with the extension. refuted : findings with an effect that raises the torque error
-    of the test sessions. rejected : whether all of the extension went. errors : of base and extended model in the test
-    sessions, None without any."""
+    """The models of the diagnosis. added : what the extended one has more. before, after : held-out rows without and
+    with the extension. refuted : findings with an effect that raises the torque error of the test sessions. rejected :
+    whether all of the extension went. errors : of base and extended model in the test sessions, None without any."""
 
     base: DynamicModel
     extended: DynamicModel
     added: tuple[str, ...]
     nameless: tuple[Nameless, ...]
-    changes: Mapping[str, float]
     before: HeldOut
     after: HeldOut
     refuted: tuple[Finding, ...]
@@ -164,37 +162,48 @@ def _told_models(
 
     members : of the extension. after : held-out rows with them.
     """
-    nominal, errors = state.bench.nominal, None
-    refuted: tuple[Finding, ...] = ()
-    notes: tuple[str, ...] = ()
     by_identify = task.sound and state.bench.evidence.drawn
+    refuted, errors = tuple[Finding, ...](), None
     if task.test and not by_identify:
         after, made, refuted, errors = without_harm(task, state, baseline, members, after)
     else:
         made = fitted_models(task, state, baseline, members, after)
-    base, extended, nameless, rejected = made.base, made.extended, made.nameless, False
     before, after = baseline.held.where(after), after.where(baseline.held)
-    added = titles(made.added)
+    told = _Told(
+        made.base, made.extended, titles(made.added), made.nameless, before, after, refuted, False, errors
+    )
     if by_identify:
         try:
-            fitted, ways = refitted(task, nominal, made.added)
-            shipped = _shipped(task, nominal, fitted, ways, members, (before, after))
+            told = _by_identify(task, state, members, made.added, told)
         except DataError as error:
-            notes = (f"the models are those of the evidence, for `identify` says: {error}",)
-        else:
-            base, (extended, before, after, errors, rejected) = fitted, shipped
-            own = titles(base.effects)
-            more = [entry for entry in extended.effects if title(entry) not in own]
-            if rejected and errors is not None:
-                gone = {(entry["cause"], tuple(entry["joints"])) for entry in more}
-                named = [*(m.finding for m in members if m.finding is not None), *state.timing]
-                refuted = tuple(f for f in named if (f.cause, f.joints) in gone)
-                extended, after, errors, nameless, more = base, before, (errors[0], errors[0]), (), []
-            added = titles(more)
-        if task.test and errors is None:
-            errors = errors_of_both(base, extended, task.test)
-    changes = changes_of(base, extended) if added else {}
-    return _Told(base, extended, added, nameless, changes, before, after, refuted, rejected, errors, notes)
+            told = told._replace(
+                notes=(f"the models are those of the evidence, for `identify` says: {error}",)
+            )
+    if task.test and told.errors is None:
+        told = told._replace(errors=errors_of_both(told.base, told.extended, task.test))
+    return told
+
+
+def _by_identify(task: Task, state: State, members: Sequence[Member], added: Entries, told: _Told) -> _Told:
+    """The models by `identify` in place of those by the evidence, `told`. added : effects of the extension.
+
+    Raises DataError for sessions that `identify` refuses.
+    """
+    nominal = state.bench.nominal
+    base, ways = refitted(task, nominal, added)
+    extended, before, after, errors, harmful = _shipped(
+        task, nominal, base, ways, members, (told.before, told.after)
+    )
+    own = titles(base.effects)
+    more = [entry for entry in extended.effects if title(entry) not in own]
+    if errors is None or not harmful:
+        return told._replace(
+            base=base, extended=extended, added=titles(more), before=before, after=after, errors=errors
+        )
+    gone = {(entry["cause"], tuple(entry["joints"])) for entry in more}
+    named = [*(m.finding for m in members if m.finding is not None), *state.timing]
+    refuted = tuple(f for f in named if (f.cause, f.joints) in gone)
+    return _Told(base, base, (), (), before, before, refuted, True, (errors[0], errors[0]))
 
 
 def _shipped(
