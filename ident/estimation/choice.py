@@ -234,7 +234,10 @@ def choose(
     final = replace(settled, estimator=estimator_factory(winner.estimator, **options))
     sessions = [_calibrated(session, choice.gains) for session in sessions]
     if winner.tilt:
-        mounting = find_mounting(sessions, chain, final, known=first.known)
+        # The prior as stated, however loose the winner's: bodies free of it absorb a part of the tilt. Placeholder
+        # masses know nothing of it.
+        strength = _LOOSEST if choice.urdf_doubt else 1.0
+        mounting = find_mounting(sessions, chain, final, prior_strength=strength, known=first.known)
         found, choice = mounting.identification, replace(choice, mounting=mounting)
     elif choice.gains:
         found = identify(sessions, chain, final, known=first.known)

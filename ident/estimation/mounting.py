@@ -26,7 +26,13 @@ from ident.dynamics.parameters import INERTIAL, Floats
 from ident.dynamics.regressor import torque
 from ident.dynamics.structure import ModelStructure, Side
 from ident.effects.link import sideways_gravity
-from ident.estimation.identify import Identification, IdentificationSettings, Known, identify
+from ident.estimation.identify import (
+    Identification,
+    IdentificationSettings,
+    Known,
+    estimator_factory,
+    identify,
+)
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Covariance, fisher_tail
 from ident.estimators.physical import cad_prior, lacking_bodies
@@ -111,6 +117,7 @@ def find_mounting(
     settings: IdentificationSettings | None = None,
     *,
     prior_std_rad: float = float(np.deg2rad(2.0)),
+    prior_strength: float = 1.0,
     steps: int = 6,
     known: Known | None = None,
 ) -> Mounting:
@@ -119,6 +126,7 @@ def find_mounting(
     sessions, settings, known : as for `identify`. The steps are maximum a posteriori with the inertials of the URDF as
         prior (`cad_prior`; weighted least squares without one), so that weakly excited parameters do not
         absorb the tilt.
+    prior_strength : factor on the variance of that prior.
     prior_std_rad : standard deviation of the tilt before the data. It hardly matters beside a tenth of a degree
         from the data, and keeps an unexcited angle at zero.
 
@@ -137,7 +145,8 @@ def find_mounting(
     axes = _axes(chain.gravity)
     tilt = np.zeros(2)
     # The steps need plausible values of all parameters, with any final estimator.
-    inner = replace(settings, essential=None, estimator="wls" if lacking_bodies(chain) else "map")
+    estimator = "wls" if lacking_bodies(chain) else estimator_factory("map", prior_strength=prior_strength)
+    inner = replace(settings, essential=None, estimator=estimator)
     found = identify(sessions, chain, inner, known=known)
     settings = replace(found.settings, essential=settings.essential, estimator=settings.estimator)
     inner = found.settings
@@ -145,7 +154,8 @@ def find_mounting(
     covariance = None
     while done < steps and not converged:
         done += 1
-        step, covariance = _step(found, sessions, axes, tilt, prior_std_rad)
+        prior = _prior(found, tilt, prior_std_rad, prior_strength)
+        step, covariance = _step(found, sessions, axes, prior)
         tilt = tilt + step
         turned = replace(chain, gravity=_turned(chain.gravity, axes, tilt))
         found = identify(sessions, turned, inner, known=found.known)
@@ -180,16 +190,13 @@ def _turned(gravity: Floats, axes: Floats, tilt: Floats) -> Floats:
 
 
 def _step(
-    found: Identification, sessions: Sequence[Session], axes: Floats, tilt: Floats, prior_std_rad: float
+    found: Identification, sessions: Sequence[Session], axes: Floats, prior: Prior
 ) -> tuple[Floats, Covariance]:
     """One Gauss-Newton step (2,) with all base parameters free, and the covariance of the tilt."""
     gravity = found.structure.chain.gravity
     columns = _columns(found, sessions, list(sideways_gravity(gravity, axes)))
     problem = found.problem.with_columns(("tilt_1", "tilt_2"), columns, "rad")
-    estimator = MaximumAPosteriori(
-        _prior(found, tilt, prior_std_rad), 1.0, CovarianceSettings(kind="jackknife")
-    )
-    estimate = estimator.fit(problem)
+    estimate = MaximumAPosteriori(prior, 1.0, CovarianceSettings(kind="jackknife")).fit(problem)
     posterior, jackknife = (estimate.covariances[kind] for kind in ("posterior", "jackknife"))
     std = np.maximum(posterior.std, jackknife.std)[-2:]
     correlation = posterior.matrix[-2:, -2:] / np.outer(posterior.std[-2:], posterior.std[-2:])
@@ -299,13 +306,14 @@ def _at_rest(session: PreparedSession) -> PreparedSession:
     return replace(session, passages=passages)
 
 
-def _prior(found: Identification, tilt: Floats, prior_std_rad: float) -> Prior:
-    """The arm's prior with the tilt's: zero for the whole tilt, earlier steps included."""
+def _prior(found: Identification, tilt: Floats, prior_std_rad: float, strength: float) -> Prior:
+    """The arm's prior, `strength` times its variance, with the tilt's: zero for the whole tilt, earlier steps
+    included."""
     p = len(found.base.names)
     mean, precision = np.zeros(p + 2), np.zeros((p + 2, p + 2))
     if not lacking_bodies(found.structure.chain):
         arm = cad_prior(found.base).prior("pullback")
-        mean[:p], precision[:p, :p] = arm.mean, arm.precision
+        mean[:p], precision[:p, :p] = arm.mean, arm.precision / strength
     mean[p:] = -tilt
     precision[p, p] = precision[p + 1, p + 1] = prior_std_rad**-2
     return Prior(mean, precision)

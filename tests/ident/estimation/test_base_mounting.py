@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
+from ident.estimation.choice import choose
 from ident.estimation.identify import IdentificationSettings, identify
 from ident.estimation.mounting import find_mounting, tilt_columns
 from ident.estimators import nearest_consistent
@@ -88,6 +90,17 @@ def test_an_upright_base_stays_upright() -> None:
         assert np.rad2deg(np.linalg.norm(found.tilt_rad)) < 0.1
         probabilities.append(found.p_value)
     assert min(probabilities) > 0.01
+
+
+def test_the_masses_of_a_placeholder_do_not_hold_the_base_upright(tmp_path: Path) -> None:
+    path = tmp_path / "light.urdf"
+    path.write_text(re.sub(r'<mass value="[^"]*"', '<mass value="0.01"', find("lwr4plus.urdf").read_text()))
+    found = choose([recorded(leaning(0.03, -0.01), seed=4)], Chain.from_urdf(path), MODEL_1)
+    assert found.choice is not None
+    mounting = found.choice.mounting
+    assert mounting is not None
+    assert mounting.tilt_rad[0] == pytest.approx(0.03, abs=0.01)
+    assert np.all(np.abs(mounting.tilt_rad - [0.03, -0.01]) < 2.0 * mounting.std)
 
 
 def test_the_lean_is_part_of_what_is_printed_and_stored() -> None:
