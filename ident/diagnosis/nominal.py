@@ -35,6 +35,7 @@ from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.binned import Motion, binned_regressor, bins
 from ident.rows.filters import differentiate, low_pass, settling
+from ident.rows.reversals import ringing
 from lwr_driver.session.spool import Arena, column, spans, stored, stored_together
 
 Floats = NDArray[np.float64]
@@ -535,7 +536,7 @@ class Nominal:
                 target, usable, speed = stretch.motor, stretch.motor_usable, motion.motor_speed
             else:
                 target, usable, speed = stretch.effort, stretch.usable, motion.qd
-            moves = self._moves(stretch, speed, at)
+            moves = self._moves(stretch, speed, at, drives=side == "motor")
             dt = width * usual_step(stamp)
             stamps = self._stamps(side, stretch)
             chosen = self._windows(recording, stamps)
@@ -581,8 +582,13 @@ class Nominal:
         wide = self._matrix(side, motion, recording, stretch.time, at, width)
         return np.stack([self._slow(side, table, width * usual_step(stamp)) for table in wide])[:, chosen]
 
-    def _moves(self, stretch: RecordStretch, speed: Floats, at: Floats) -> NDArray[np.bool_]:
-        """Whether joints move in one direction for a while before and after times (m,), away from rest, (m, n)."""
+    def _moves(
+        self, stretch: RecordStretch, speed: Floats, at: Floats, *, drives: bool
+    ) -> NDArray[np.bool_]:
+        """Whether joints move in one direction for a while before and after times (m,), away from rest, (m, n).
+
+        drives : whether it has to be a motion of the drives and not a ringing of their links.
+        """
         dt = float(stretch.time[1] - stretch.time[0])
         least = self.settings.standstill_rad_s
         size = 2 * round(self.settings.reversal_s / dt) + 1
@@ -595,6 +601,8 @@ class Nominal:
             steady = (minimum_filter1d(own, size) > 0.0) | (maximum_filter1d(own, size) < 0.0)
             rests = maximum_filter1d(np.abs(own), wide) <= least
             steady &= ~maximum_filter1d(rests, 2 * wide - 1)
+            if drives:
+                steady &= ~ringing(own, dt)
             moves = np.abs(_at(stretch.time, own[:, None], at)) > least
             found[:, joint] = (moves & (_at(stretch.time, steady[:, None].astype(float), at) > 0.999))[:, 0]
         return found

@@ -11,13 +11,15 @@ from ident.dynamics.parameters import Floats
 TURNING_RAD = 1e-3
 """Friction of a drive turns over a path: tenths of a milliradian in strain-wave gears, whatever the time it takes."""
 _LONGEST_S = 10.0
+RINGING_S = 0.1
+"""A link that swings at 5 Hz or faster rings on its spring, beside a drive that may stand still."""
 
 
 def away_from_reversals(
     speed: Floats, dt: float, window_s: float, standstill_rad_s: float, turning_rad: float
 ) -> NDArray[np.bool_]:
-    """Samples (n, J) whose joint keeps its direction, faster than standstill, for `window_s` before and after, and has
-    gone `turning_rad` since its reversal or rest.
+    """Samples (n, J) whose joint keeps its direction, faster than standstill, for `window_s` before and after, has gone
+    `turning_rad` since its reversal or rest, and does not ring.
 
     speed : (n, J) every `dt` seconds [rad/s].
     """
@@ -26,12 +28,26 @@ def away_from_reversals(
     away = np.asarray((lowest > standstill_rad_s) | (highest < -standstill_rad_s))
     if turning_rad > 0.0:
         away &= _path(speed, dt, standstill_rad_s) >= turning_rad
+    for joint, own in enumerate(speed.T):
+        away[:, joint] &= ~ringing(own, dt)
     return away
+
+
+def ringing(speed: Floats, dt: float) -> NDArray[np.bool_]:
+    """Samples (n,) between two reversals within `RINGING_S` of one another.
+
+    speed : (n,) of a joint every `dt` seconds [rad/s].
+    """
+    turns = np.flatnonzero(np.diff(np.signbit(speed))) + 1
+    quick = np.diff(turns) * dt < RINGING_S
+    # No swing is known before the first reversal and after the last one.
+    lengths = np.diff(np.concatenate([[0], turns, [len(speed)]]))
+    return np.repeat(np.concatenate([[False], quick, [False]])[: len(lengths)], lengths)
 
 
 def turning_reach(window_s: float, standstill_rad_s: float, turning_rad: float) -> float:
     """Time [s] that `away_from_reversals` looks back and ahead: that of the path at the slowest speed, 10 s at most."""
-    return window_s + min(turning_rad / max(standstill_rad_s, 1e-4), _LONGEST_S)
+    return max(window_s + min(turning_rad / max(standstill_rad_s, 1e-4), _LONGEST_S), RINGING_S)
 
 
 def _path(speed: Floats, dt: float, standstill_rad_s: float) -> Floats:

@@ -30,7 +30,7 @@ from ident.rows.filters import (
 )
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import prepare
-from ident.rows.reversals import away_from_reversals, turning_reach
+from ident.rows.reversals import RINGING_S, away_from_reversals, turning_reach
 from ident.rows.sessions import payload_name, require, stated_mass
 from ident.rows.timebase import flag_outliers, sample_period, stretches
 from lwr_driver.session import Phase, Session
@@ -57,7 +57,21 @@ def test_a_slow_joint_has_to_go_on_for_the_path_on_which_friction_turns():
     assert np.flatnonzero(away).tolist() == [*range(19, 58), *range(62, 110)]
     assert away_from_reversals(speed, 0.01, 0.0, 0.002, 0.0)[10:].all()
     assert turning_reach(0.02, 0.002, 1e-3) == pytest.approx(0.52)
-    assert turning_reach(0.0, 0.002, 0.0) == 0.0
+    assert turning_reach(0.0, 0.002, 0.0) == RINGING_S
+
+
+def test_a_link_that_rings_after_a_move_tells_nothing_of_its_drive():
+    t = 0.002 * np.arange(1000)
+    move, ring = 0.5 * np.sin(np.pi * t), -0.05 * np.sin(2.0 * np.pi * 7.0 * (t - 1.0))
+    speed = np.where(t < 1.0, move, ring)
+    away = away_from_reversals(speed[:, None], 0.002, 0.0, 0.002, 0.0)[:, 0]
+    assert away[5:480].all()
+    # The last swing has no end yet.
+    assert not away[500:920].any()
+    slow = away_from_reversals(
+        np.where(t < 1.0, move, np.sin(2.0 * np.pi * 3.0 * t))[:, None], 0.002, 0.0, 0.002, 0.0
+    )
+    assert np.mean(slow[500:]) > 0.95
 
 
 # ---- settings and filters ----
