@@ -26,6 +26,7 @@ from ident.diagnosis.bench import (
 from ident.diagnosis.broken_data import broken_channels, refuse, without_broken
 from ident.diagnosis.character import character
 from ident.diagnosis.evidence import Evidence, Floats, Rows
+from ident.diagnosis.held_out import held_out
 from ident.diagnosis.nominal import GAIN_STD, Nominal, NominalArm
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
@@ -276,7 +277,7 @@ def commission(
     days = [_day(known, recordings, settings, base) for recordings in recorded]
     null: dict[tuple[str, int], float] = {}
     shown: dict[tuple[str, int], dict[str, float]] = {}
-    tables = []
+    tables, left = [], []
     for number, recordings in enumerate(recorded):
         others = [day for k, day in enumerate(days) if k != number]
         rest = _reference(others, known, robot, parts[0], {}, days) if others else None
@@ -289,6 +290,7 @@ def commission(
             mean = shown.setdefault(candidate.key, {})
             for shape, value in bench.dictionary.information(candidate).items():
                 mean[shape] = mean.get(shape, 0.0) + value / len(parts)
+        left.append(_left(known, recordings, settings, rest))
         log.info("healthy set %d of %d", number + 1, len(parts))
     found = _reference(days, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
     provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals) | known.delays}
@@ -298,6 +300,7 @@ def commission(
         shown=shown,
         usual=usual_sizes(tables),
         compliance_std=known.compliance_std,
+        left={side: np.fmax.reduce([one[side] for one in left]) for side in left[0]},
     )
 
 
@@ -469,6 +472,23 @@ def _day(
         _gains(bench, selection.nuisance_rows),
         bench.nominal.whole_friction(values),
     )
+
+
+def _left(
+    arm: NominalArm,
+    recordings: Sequence[SessionRecord],
+    settings: DiagnosisSettings,
+    reference: Reference | None,
+) -> dict[str, Floats]:
+    """Rms (n,) [Nm] by side of the set's last session with a payload of another one, as predicted from the others
+    beside what differs from day to day; without such a session, of parts of the motion predicted in turn.
+    """
+    payloads = [one.payload for one in recordings]
+    last = max((k for k, one in enumerate(payloads) if payloads.count(one) > 1), default=-1)
+    held = [replace(one, test=k == last) for k, one in enumerate(recordings)]
+    bench = prepare_bench(arm, held, settings, reference, (), fit_compliance=False)
+    nuisance = select(bench.dictionary, bench.evidence, settings, None).nuisance_rows
+    return held_out(bench.evidence, nuisance).rms()
 
 
 def _gains(bench: DiagnosisBench, nuisance: Sequence[Rows]) -> Floats:

@@ -582,9 +582,7 @@ class Nominal:
         wide = self._matrix(side, motion, recording, stretch.time, at, width)
         return np.stack([self._slow(side, table, width * usual_step(stamp)) for table in wide])[:, chosen]
 
-    def _moves(
-        self, stretch: RecordStretch, speed: Floats, at: Floats, *, drives: bool
-    ) -> NDArray[np.bool_]:
+    def _moves(self, stretch: RecordStretch, speed: Floats, at: Floats, *, drives: bool) -> NDArray[np.bool_]:
         """Whether joints move in one direction for a while before and after times (m,), away from rest, (m, n).
 
         drives : whether it has to be a motion of the drives and not a ringing of their links.

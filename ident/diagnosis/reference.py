@@ -73,7 +73,8 @@ class Reference:
     compliance from its scatter over the sets, None for a single one; 0 where no set differs from the first beyond
     chance, and half of a stated compliance that the sets do not tell. shown : mean information of the sets on each
     candidate, by shape of its grid: the fall of the chi-square for a unit of its coefficients. usual : size of each
-    candidate on the healthy arm.
+    candidate on the healthy arm. left : rms (n,) [Nm] by side of a held-out session of the set in which it is largest,
+    beside what differs from day to day; empty if unknown.
     """
 
     model: DynamicModel
@@ -95,6 +96,7 @@ class Reference:
     correlated: Mapping[str, Floats] = field(default_factory=dict)
     shown: Mapping[tuple[str, int], Mapping[str, float]] = field(default_factory=dict)
     usual: Mapping[tuple[str, int], UsualSize] = field(default_factory=dict)
+    left: Mapping[str, Floats] = field(default_factory=dict)
 
     @property
     def unknown_stiffness(self) -> tuple[str, ...]:
@@ -138,8 +140,9 @@ class Reference:
             }
             usual = {_split(key): UsualSize.read(one) for key, one in stored.get("usual", {}).items()}
             compliance = np.array(stored["compliance"], dtype=np.float64)
-            noise = {side: np.array(v, dtype=np.float64) for side, v in stored["noise"].items()}
-            correlated = {side: np.array(v, dtype=float) for side, v in stored.get("correlated", {}).items()}
+            noise, correlated, left = (
+                _by_side(stored.get(key, {})) for key in ("noise", "correlated", "left")
+            )
             delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
             delay_std = {side: float(v) for side, v in stored.get("delay_std_s", {}).items()}
             sets, encoder = int(stored["sets"]), str(stored["encoder"])
@@ -181,6 +184,7 @@ class Reference:
             correlated,
             shown,
             usual,
+            left,
         )
 
     def stored(self) -> dict[str, Any]:
@@ -194,6 +198,7 @@ class Reference:
                 "delay_std_s": dict(self.delay_std_s),
                 "noise": {side: _listed(values) for side, values in self.noise.items()},
                 "correlated": {side: _listed(values) for side, values in self.correlated.items()},
+                "left": {side: _listed(values) for side, values in self.left.items()},
                 "null": {
                     f"{cause} {joint + 1}": round(float(v), 2) for (cause, joint), v in self.null.items()
                 },
@@ -405,6 +410,10 @@ def last_body(base: BaseSet) -> Floats:
 def joint_of(name: str) -> int:
     """Number from 0 of the joint of a drive's base parameter."""
     return int("".join(c for c in name if c.isdigit())) - 1
+
+
+def _by_side(stored: Mapping[str, Sequence[float]]) -> dict[str, Floats]:
+    return {side: np.array(values, dtype=np.float64) for side, values in stored.items()}
 
 
 def _listed(values: Floats | None) -> list[float] | None:

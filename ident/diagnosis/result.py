@@ -192,6 +192,7 @@ class Diagnosis(Tabular):
     base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
     changes : change of the base parameters by the extension, in their standard deviations.
     rms_base, rms_extended : rms error (n,) [Nm] by side in the held-out rows, beside the noise_floor of these rows.
+    healthy_left : the same of the base model on the healthy arm of the reference, empty if unknown.
     torque_base, torque_extended : errors of the models in the test sessions with all samples, None without any.
     notes : sentences on limits of the data. data : broken channels, left out.
     residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN in unused rows.
@@ -222,6 +223,7 @@ class Diagnosis(Tabular):
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
     data: tuple[BrokenChannel, ...] = ()
     healthy: tuple[Mapping[str, Any], ...] = ()
+    healthy_left: Mapping[str, Floats] = field(default_factory=dict)
     torque_base: TorqueErrors | None = None
     torque_extended: TorqueErrors | None = None
 

@@ -272,15 +272,28 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
         return "look", f"{count} causes found, the largest effect first" + (doubt if doubtful else "")
     if content.get("character"):
         return "good", "No cause found beyond the character of such an arm, which the extended model now has"
-    if content.get("nameless") or content.get("unexplained"):
-        return "look", "The data support no cause, but the residuals depend on the motion"
-    worst = max((row["avoidable_share"] for row in details.get("rows", [])), default=0.0)
-    if worst < _AVOIDABLE_LOOK:
+    rest = [*content.get("nameless", []), *content.get("unexplained", [])]
+    if rest:
+        of_time = all(one["depends_on"] == ["time"] for one in rest)
+        on = "change with the time and not with the motion" if of_time else "depend on the motion"
+        return "look", f"The data support no cause, but the residuals {on}"
+    rows = details.get("rows", [])
+    if max((row["avoidable_share"] for row in rows), default=0.0) < _AVOIDABLE_LOOK:
         return "good", "No model error is detectable in these data"
+    beyond = max(map(_beyond_healthy, rows))
+    if beyond < _AVOIDABLE_LOOK:
+        return "good", "No cause found, and no more error on held-out data than on the healthy days"
+    than = "that of the healthy days" if any(row.get("healthy") for row in rows) else "the noise"
     return "look", (
-        f"The data support no cause, but up to {100 * worst:.0f} % of the error's power on held-out data is above the "
-        "noise; more or repeated motions may show the cause"
+        f"The data support no cause, but up to {100 * beyond:.0f} % of the error's power on held-out data is above "
+        f"{than}; more or repeated motions may show the cause"
     )
+
+
+def _beyond_healthy(row: Plain) -> float:
+    """Share of power of the base model's error above the noise, and above its error on the healthy arm."""
+    share, healthy = float(row["avoidable_share"]), row.get("healthy")
+    return min(share, 1.0 - (healthy / row["test_rms_base"]) ** 2) if healthy and share > 0.0 else share
 
 
 def _lines(
@@ -406,17 +419,19 @@ def _gain(content: Plain, details: Plain, names: Sequence[str]) -> Part:
     is_named = is_extended(content)
     sessions = ", ".join((content.get("sessions") or {}).get("test") or [])
     both = bool(sessions) and "rows_base" in gain
+    usual = ["healthy days"] * any(row.get("healthy") is not None for row in measured.values())
     rows: list[Row] = []
     for side, errors in (gain.get("rows_base" if both else "test_rms_base") or {}).items():
         for k in range(len(errors or ())):
             row = measured.get((side, k + 1), {})
             share, span = row.get("avoidable_share"), row.get("gain_interval_95")
-            noise = Number(_at(floor, side, k), ".4f")
+            noise = [Number(_at(floor, side, k), ".4f")]
+            noise += [Number(row.get("healthy"), ".4f")] * bool(usual)
             shown = _models(gain, "test_rms", side, k)[: 1 + is_named]
             change = [_change(*shown)] if is_named else []
-            cells: list[str | Number] = [noise, *shown, *change]
+            cells: list[str | Number] = [*noise, *shown, *change]
             if both:
-                cells = [*shown, *change, noise, *_models(gain, "rows", side, k)[: 1 + is_named]]
+                cells = [*shown, *change, *noise, *_models(gain, "rows", side, k)[: 1 + is_named]]
             if is_named:
                 text = "–" if not span else f"{span[0]:+.4f} to {span[1]:+.4f}"
                 cells.append(text.replace("-", "\N{MINUS SIGN}"))
@@ -441,10 +456,10 @@ def _gain(content: Plain, details: Plain, names: Sequence[str]) -> Part:
             f"Torque error of {entry['session']} (all samples, as of `validate`): {', '.join(parts)}."
         )
     more, inside = ["extended [Nm]", "change %"] * is_named, ["gain [Nm], 95 %"] * is_named
-    head = ["torque", "noise [Nm]", "base model [Nm]", *more, *inside, "avoidable %"]
+    head = ["torque", "noise [Nm]", *usual, "base model [Nm]", *more, *inside, "avoidable %"]
     if both:
         more, inside = ["extended", "change %"] * is_named, ["rows: extended", "gain, 95 %"] * is_named
-        head = ["rms [Nm]", "base", *more, "rows: noise", "rows: base", *inside, "avoidable %"]
+        head = ["rms [Nm]", "base", *more, "rows: noise", *usual, "rows: base", *inside, "avoidable %"]
     return Part("gain", "Gain" if is_named else "Error on held-out data", sentences, head, rows)
 
 

@@ -33,8 +33,9 @@ _TRACE = ("time", "session", "position", "velocity", "load", "motor_angle", "fir
 def row_gains(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Held-out torque error of each joint (from 1) and side [Nm], as plain content of details.json.
 
-    noise_floor : of the error of any model. gain : base minus extended, with its 95 % interval from blocks drawn with
-    replacement. avoidable : the part of the base model's error above the noise, its share as a share of power.
+    noise_floor : of the error of any model. healthy : the same error on the healthy arm of the reference, None if
+    unknown. gain : base minus extended, with its 95 % interval from blocks drawn with replacement. avoidable : the part
+    of the base model's error above the noise, its share as a share of power.
     """
     found = []
     for side, base in diagnosis.residuals.get("base", {}).items():
@@ -46,12 +47,14 @@ def row_gains(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         for joint in np.flatnonzero(np.isfinite(base).any(axis=0)).tolist():
             rms_base, rms_extended, low, high = interval(before, after, [(side, joint)], _SEED)
             noise = float(diagnosis.noise_floor[side][joint])
+            healthy = diagnosis.healthy_left.get(side, np.full(base.shape[1], np.nan))[joint]
             avoidable = math.sqrt(max(0.0, rms_base**2 - noise**2))
             found.append(
                 {
                     "side": side,
                     "joint": joint + 1,
                     "noise_floor": noise,
+                    "healthy": float(healthy) if np.isfinite(healthy) else None,
                     "test_rms_base": rms_base,
                     "test_rms_extended": rms_extended,
                     "gain": rms_base - rms_extended,

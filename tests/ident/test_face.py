@@ -222,5 +222,9 @@ def test_a_reference_is_kept_in_a_file(bench: Any, logs: tuple[Path, Path], tmp_
     assert [[row[k] for k in said] for row in by_path.records()] == [
         [row[k] for k in said] for row in by_value.records()
     ]
+    np.testing.assert_allclose(by_path.healthy_left["joint"], reference.left["joint"])
+    # One healthy set: parts of its motion, predicted in turn.
+    assert np.all(reference.left["joint"] < 3.0 * by_path.rms_base["joint"])
+    assert np.all(reference.left["joint"] > reference.noise["joint"] / 3.0)
     # The file keeps ten digits of the covariance.
     np.testing.assert_allclose(by_path.rms_base["joint"], by_value.rms_base["joint"], rtol=1e-6)
