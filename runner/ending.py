@@ -29,6 +29,8 @@ if TYPE_CHECKING:  # a command imports its own alone
     from lwr_driver.session.session import SessionSummary
     from runner.preflight import Preflight
 
+_AT_ONCE_MRAD = 0.1
+
 
 @dataclass(frozen=True)
 class Ending:
@@ -96,7 +98,11 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         lengths = [1e3 * one for one in turning["length_rad"].values()]
         least, most = (f"{float(f'{one:.2g}'):g}" for one in (min(lengths), max(lengths)))
         error = turning["torque_error_percent"]
-        text = f"of {len(lengths)} drives turns over {least} to {most} mrad, in the model: "
+        span = most if least == most else f"{least} to {most}"
+        # Over less than an encoder's noise it turns at once, and only rests are predicted better.
+        turns = "stays at rest as it was" if max(lengths) < _AT_ONCE_MRAD else f"turns over {span} mrad"
+        drives = f"{len(lengths)} drives" if len(lengths) > 1 else "one drive"
+        text = f"of {drives} {turns}, in the model: "
         text += f"motor torque error of the fit {error['without']:.3g} -> {error['with']:.3g} %"
         found.append(("friction", text))
     late = [text for text in (_delay_of(summary, "motor"), _delay_of(summary, "joint")) if text]

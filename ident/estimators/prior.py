@@ -216,11 +216,10 @@ class Disagreement:
         beyond = sum(abs(z) > 2.0 for z in self.deviations)
         pairs = zip(self.names[:5], self.deviations[:5], strict=True)
         worst = ", ".join(f"{name} {z:+.1f}" for name, z in pairs)
-        single = (
-            f"{beyond} of {len(self.names)} parameters beyond two ({worst})"
-            if worst
-            else "in combinations of parameters, for no single one is known better than from the URDF"
-        )
+        single = f"{beyond} of {len(self.names)} parameters beyond two ({worst})"
+        if not beyond:
+            known = f"beyond two ({worst})" if worst else "known better than from the URDF"
+            single = f"in combinations of parameters, no single one {known}"
         if self.scaled:
             return (
                 f"the data are {self.factor:.2f} ± {self.factor_std:.2f} times what the URDF's inertials predict, in "

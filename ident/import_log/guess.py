@@ -30,6 +30,8 @@ from lwr_driver.listing import Listing, Piece, text_of
 
 _ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
 _RATES = {"rad/s": 1.0, "deg/s": 180.0 / math.pi, "rpm": 30.0 / math.pi}
+# Share of rows whose times go back, beyond which the order of the rows is in doubt.
+_STEPS_BACK = 0.001
 _SHORTEST_S, _LONGEST_S = 1e-4, 0.1
 _RATIO = 1.5
 """Largest factor between dq/dt and a velocity in the right unit; the units are factors of 5 apart."""
@@ -268,8 +270,23 @@ class _Guesser:
 
     def _unknown(self, quantity: str) -> DataError:
         listed = "; ".join(f"{one.shown} ({one.values.shape[1]})" for one in self.fields) or "nothing"
+        counts = [one.values.shape[1] for one in self.fields if one.quantity == "position"]
+        short = next(
+            (
+                one
+                for one in self.fields
+                if one.quantity == quantity and one.values.shape[1] < max(counts, default=0)
+            ),
+            None,
+        )
+        told = f"no {quantity} by its name"
+        if short is not None:
+            told = (
+                f"{short.shown} are {short.values.shape[1]} columns of {quantity} for {max(counts)} joints; one is "
+                "missing or empty"
+            )
         return DataError(
-            f"{self.source}: no {quantity} by its name. Found, with the number of columns: {listed}. Write a mapping "
+            f"{self.source}: {told}. Found, with the number of columns: {listed}. Write a mapping "
             "file for `lwr-run import`; docs/import_mapping.md has its keys and an example"
         )
 
@@ -404,13 +421,27 @@ class _Guesser:
             period = (_RATES["deg/s"] if unit == "deg" else 1.0) / max(steps.ratio, 1e-9)
             if steps.alike > ALIKE and _SHORTEST_S <= period <= _LONGEST_S:
                 rate = float(f"{1.0 / period:.3g}")
-                self.rows.append(
-                    ("time", "", "", f"{rate:g} Hz, from the positions against {velocity.shown}")
-                )
+                why = f"{rate:g} Hz, from the positions against {velocity.shown}{self._going_back(count)}"
+                self.rows.append(("time", "", "", why))
                 return TimeBase(rate_hz=rate), np.arange(count) / rate
         raise DataError(
             f"{self.source}: no rising column of times; give the rate of the samples with --rate-hz"
         )
+
+    def _going_back(self, count: int) -> str:
+        """Why a column of times is not used, for the table. DataError where the order of the samples is in doubt."""
+        for one in self.fields:
+            if one.quantity == "time" and len(one.values) == count:
+                back = np.flatnonzero(np.diff(one.values[:, 0]) < 0.0)
+                if len(back) > max(1.0, _STEPS_BACK * count):
+                    raise DataError(
+                        f"{self.source}: the times of {one.shown} go back in {len(back)} of {count} rows, first in row "
+                        f"{back[0] + 2}; sort the rows by their times, or give the rate of the samples with --rate-hz "
+                        "if the rows are in order"
+                    )
+                if len(back):
+                    return f"; {one.shown} goes back in row {back[0] + 2} and is not used"
+        return ""
 
     def _clock_of(self, count: int) -> Field | None:
         """The column of times of `count` samples; of a date split in two, the finer part."""

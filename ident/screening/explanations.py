@@ -28,6 +28,8 @@ UNITS = {
     1.0 / 60.0: "per second for per minute",
 }
 """Factor of the recorded over the true value, and its usual cause."""
+TORQUE_UNITS = {factor: name for factor, name in UNITS.items() if "unit" in name}
+"""The same of torques, which are no angles."""
 _NEAR = 0.1
 # Residual over torque of an arm whose channels agree; beyond it explanations are sought.
 AGREES = 0.1
@@ -64,12 +66,12 @@ class Explanation:
     alike: tuple[Explanation, ...] = ()
 
 
-def unit_of(factor: float) -> str:
-    """What a factor between recorded and true value looks like."""
+def unit_of(factor: float, *, torque: bool = False) -> str:
+    """What a factor between recorded and true value looks like, of a `torque` or of a position."""
     if factor < 0.0:
-        rest = unit_of(-factor)
+        rest = unit_of(-factor, torque=torque)
         return "a reversed sign" if abs(factor + 1.0) < 0.5 else f"a reversed sign and {rest}"
-    for known, name in UNITS.items():
+    for known, name in (TORQUE_UNITS if torque else UNITS).items():
         if abs(np.log(factor / known)) < _NEAR:
             return name
     return f"a gain of {factor:.3g}"
@@ -145,7 +147,7 @@ def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanat
             scale = np.eye(data.chain.n)
             scale[joint, joint] = 1.0 / factor
             mended = data.mapped(side, scale)
-            yield Explanation(f"{side} torque", (joint,), unit_of(factor), mended, 0.0, factor)
+            yield Explanation(f"{side} torque", (joint,), unit_of(factor, torque=True), mended, 0.0, factor)
     for side in data.sides:
         for a, b in _pairs(data):
             if (side, a) not in data.silent and (side, b) not in data.silent:
@@ -189,7 +191,13 @@ def _scaled_part(
     scale[key[1], key[1]] = 1.0 / factor
     mended = data.mapped(key[0], scale, parts=parts)
     return Explanation(
-        f"{key[0]} torque", (key[1],), unit_of(factor), mended, factor=factor, error=error, parts=parts
+        f"{key[0]} torque",
+        (key[1],),
+        unit_of(factor, torque=True),
+        mended,
+        factor=factor,
+        error=error,
+        parts=parts,
     )
 
 
@@ -228,7 +236,7 @@ def _torque_gains(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Exp
             scale = np.eye(data.chain.n)
             scale[joint, joint] = 1.0 / gain.value
             small = abs(gain.value) < 3.0 * gain.std
-            looks = "a torque in a unit far too large, or none" if small else unit_of(gain.value)
+            looks = "a torque in a unit far too large, or none" if small else unit_of(gain.value, torque=True)
             yield Explanation(
                 f"{side} torque", (joint,), looks, data.mapped(side, scale), 0.0, gain.value, gain
             )
@@ -237,7 +245,7 @@ def _torque_gains(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Exp
         if len(alike) > max(1, len(own) // 2):
             scale = np.diag([1.0 / middle if joint in alike else 1.0 for joint in range(data.chain.n)])
             yield Explanation(
-                f"{side} torque", tuple(alike), unit_of(middle), data.mapped(side, scale), 0.0, middle,
+                f"{side} torque", tuple(alike), unit_of(middle, torque=True), data.mapped(side, scale), 0.0, middle,
                 wrong[alike[0]],
             )  # fmt: skip
 
@@ -343,8 +351,8 @@ def _measured_again(candidate: Explanation, before: float, normal: Normal) -> Ex
         return candidate
     factor = candidate.factor * more
     gain = replace(candidate.gain, value=factor, std=candidate.gain.std * more)
-    named = candidate.looks_like == unit_of(candidate.factor)
-    looks_like = unit_of(factor) if named else candidate.looks_like
+    named = candidate.looks_like == unit_of(candidate.factor, torque=True)
+    looks_like = unit_of(factor, torque=True) if named else candidate.looks_like
     return replace(candidate, factor=factor, gain=gain, looks_like=looks_like, mended=mended, drop=drop)
 
 

@@ -29,7 +29,7 @@ class _Kind(NamedTuple):
     """A kind of error: least size of interest, least fall of the score with it undone, and the size in words.
 
     Without a known error, offsets beyond 3 degrees reach a fall of 0.1 on five real arms and forty simulated ones,
-    gains beyond 10 % one of 0.8 and delays beyond 20 ms one of 0.2, where torques are small.
+    gains beyond 10 % one of 0.8 and delays beyond 10 ms one of 0.2, where torques are small.
     """
 
     least: float
@@ -44,7 +44,7 @@ KINDS: Mapping[str, _Kind] = {
         lambda size, std: f"a zero offset of {np.degrees(size):.1f} ± {np.degrees(std):.1g} deg",
     ),
     "gain": _Kind(0.1, 1.0, lambda size, std: f"a gain of {1.0 + size:.3g} ± {std:.1g}"),
-    "delay": _Kind(0.02, 0.4, lambda size, std: f"positions {1e3 * size:.0f} ± {1e3 * std:.1g} ms late"),
+    "delay": _Kind(0.01, 0.4, lambda size, std: f"positions {1e3 * size:.0f} ± {1e3 * std:.1g} ms late"),
 }
 """Kinds of errors; their sizes in rad, recorded over true less one, and s."""
 

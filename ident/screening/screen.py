@@ -12,11 +12,12 @@ The thresholds lie between the scores of true faults and of wrong explanations o
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import LwrError
 from ident.dynamics.kinematics import Chain
@@ -32,7 +33,7 @@ from ident.screening.doubts import Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, explain, is_wrong, unit_of
 from ident.screening.parts import part_errors
 from ident.screening.positions import position_errors
-from ident.screening.redundancy import Class, Fit, Normal, Redundancy
+from ident.screening.redundancy import FLOOR, Class, Fit, Normal, Part, Redundancy
 from lwr_driver.session import Session, Sessions, as_sessions
 
 logger = logging.getLogger(__name__)
@@ -65,6 +66,9 @@ _DRIVES, _MOST_BY_ONE = 5.0, 10.0
 _MEND_POSITION = (
     "check zero and gain of this channel (`offset_rad` and `scale` in the mapping of the import) and the joint's frame "
     "in the URDF"
+)
+_MEND_TIME = (
+    "shift the column by that time before the import, or record it with the stamps of its own samples"
 )
 # Latest screenings: the same recordings are estimated several times.
 _MOST_SCREENED = 64
@@ -215,8 +219,8 @@ def _positions(data: Redundancy, fit: Fit, normal: Normal, sessions: Sequence[Se
             "position",
             (names[one.joint],),
             f"contradicts the torques of the other joints; {_better(one.drop)}",
-            one.looks_like,
-            _MEND_POSITION,
+            one.looks_like + _opposite(one.parts, sessions),
+            _MEND_TIME if one.kind == "delay" else _MEND_POSITION,
             False,
             sessions[one.parts[0][0]].path.name if one.parts else "",
         )
@@ -231,14 +235,24 @@ def _better(drop: float) -> str:
 def _of_the_wrong_side(one: Explanation) -> Explanation:
     """A factor between motor and joint torque of all joints: inertia tells its sign, the URDF's bodies its unit."""
     data = one.mended
-    if one.gain is None or len(one.joints) < 2 or len(data.sides) < 2:
+    if one.gain is None or len(data.sides) < 2 or (len(one.joints) < 2 and one.factor > 0.0):
         return one
     scale = np.diag([one.factor if joint in one.joints else 1.0 for joint in range(data.chain.n)])
     turned = data
     for side in data.sides:
         turned = turned.mapped(side, scale)
-    inertias = [_inertia(d.chain, _poses(d), _bodies(d, d.fit())) for d in (data, turned)]
-    if one.factor < 0.0:
+    fits = [data.fit(), turned.fit()]
+    inertias = [
+        _inertia(d.chain, _poses(d), _bodies(d, fit)) for d, fit in zip((data, turned), fits, strict=True)
+    ]
+    if len(one.joints) == 1:
+        # The other joints may not tell its sign; the difference of its torques is friction and inertia of the drive.
+        joint = one.joints[0]
+        first, second = (
+            _friction(d, fit, joint, "motor") for d, fit in zip((data, turned), fits, strict=True)
+        )
+        other = first < 0.0 < second
+    elif one.factor < 0.0:
         other = bool(np.sum(inertias[1] > 0.0) > np.sum(inertias[0] > 0.0))
     else:
         slopes = [list(_gravity_slopes(d, d.fit()).values()) for d in (data, turned)]
@@ -250,7 +264,9 @@ def _of_the_wrong_side(one: Explanation) -> Explanation:
         return one
     channel = "joint torque" if one.channel == "motor torque" else "motor torque"
     factor = 1.0 / one.factor
-    return replace(one, channel=channel, factor=factor, looks_like=unit_of(factor), mended=turned)
+    return replace(
+        one, channel=channel, factor=factor, looks_like=unit_of(factor, torque=True), mended=turned
+    )
 
 
 def _of_the_wrong_label(one: Explanation, sessions: Sequence[Session]) -> Explanation:
@@ -300,7 +316,7 @@ def _supported(one: Explanation, classes: int) -> bool:
 def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
     names = sessions[0].joint_names
     joints = tuple(names[joint] for joint in one.joints)
-    channel, session = one.channel, ""
+    channel, session, looks_like = one.channel, "", one.looks_like
     certain = one.drop > _CERTAIN
     better = _better(one.drop)
     if one.gain is not None:
@@ -310,9 +326,12 @@ def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
         strange = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
         certain = strange and one.gain.left < _LEFT
         mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
+        if one.factor < 0.0 and len(one.mended.sides) == 1:
+            mend = f"check the sign of this channel and of the joint's position; {mend.partition('; ')[2]}"
     elif one.parts and channel == "position":
         session = sessions[one.parts[0][0]].path.name
         seen = f"contradicts the torques and the other sessions; {better}"
+        looks_like += _opposite(one.parts, sessions)
         mend = _MEND_POSITION
     elif one.parts:
         session, seen, certain = _of_part(one, sessions)
@@ -343,7 +362,7 @@ def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
     else:
         seen = f"contradicts the other channels; {better}"
         mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
-    return Doubt(channel, joints, seen, one.looks_like, mend, certain, session)
+    return Doubt(channel, joints, seen, looks_like, mend, certain, session)
 
 
 def _of_part(one: Explanation, sessions: Sequence[Session]) -> tuple[str, str, bool]:
@@ -364,7 +383,7 @@ def _of_part(one: Explanation, sessions: Sequence[Session]) -> tuple[str, str, b
         return session, f"{way} by {abs(value):.3g} ± {std:.2g} Nm from start to end against {rest}", False
     if one.error.kind == "zero":
         more = "higher" if value > 0.0 else "lower"
-        either = ", or the other session's" if len(sessions) == 2 and len(one.parts) == 2 else ""
+        either = ", or the other session's" if _is_either(one.parts, sessions) else ""
         return (
             session,
             f"is {abs(value):.3g} ± {std:.2g} Nm {more} than {rest} (its zero is wrong{either})",
@@ -372,6 +391,15 @@ def _of_part(one: Explanation, sessions: Sequence[Session]) -> tuple[str, str, b
         )
     gross = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
     return session, f"is {value:.4g} ± {std:.2g} times {rest}", gross and one.error.left < _LEFT
+
+
+def _is_either(parts: Sequence[Part], sessions: Sequence[Session]) -> bool:
+    """Whether the parts are one whole session of two: with different zeros either may have the wrong one."""
+    return len({half for _, half in parts}) == len(parts) == len(sessions) == 2
+
+
+def _opposite(parts: Sequence[Part], sessions: Sequence[Session]) -> str:
+    return ", or the opposite one in the other session" if _is_either(parts, sessions) else ""
 
 
 def _poses(data: Redundancy) -> Floats:
@@ -407,12 +435,8 @@ def _physics(data: Redundancy, fit: Fit, normal: Normal) -> list[Doubt]:
     if data.sides == ("motor",):
         rows[np.arange(n), [data.place("Ia", joint) for joint in range(n)]] = 1.0
     inertia, std = rows @ fit.parameters, data.deviation(fit, normal, rows)
-    acting = np.zeros(n)
-    for side, joint in fit.rho:
-        parts = [part for part in data.rows if part.side == side]
-        torque_rms = np.sqrt(np.mean([np.var(part.torque[:, joint]) for part in parts]))
-        speeding = np.sqrt(np.mean([np.mean(part.qdd[:, joint] ** 2) for part in parts]))
-        acting[joint] = max(acting[joint], abs(inertia[joint]) * speeding / max(torque_rms, 1e-300))
+    shares = _acting(data, fit, dict(enumerate(inertia.tolist())))
+    acting = np.array([shares.get(joint, 0.0) for joint in range(n)])
     sure = (np.abs(inertia) > _DEVIATIONS * std) & (acting > _SHARE)
     negative, positive = np.flatnonzero(sure & (inertia < 0.0)), np.flatnonzero(sure & (inertia > 0.0))
     if len(negative) > len(positive) and _without_inertia(data).score - fit.score > _DOUBT:
@@ -423,7 +447,52 @@ def _physics(data: Redundancy, fit: Fit, normal: Normal) -> list[Doubt]:
             "`scale: -1` in the mapping of the import mends it",
         )
         return [Doubt(channel, names, f"the arm's inertia is negative ({listed})", looks, mend, True)]
-    return _nominal(data, fit)
+    return [*_reversed(data, fit, negative, inertia, std), *_nominal(data, fit)]
+
+
+def _reversed(
+    data: Redundancy, fit: Fit, negative: NDArray[np.int64], inertia: Floats, std: Floats
+) -> Iterator[Doubt]:
+    """Single joints with a negative inertia: their torques and those of the others have nothing in common that would
+    tell their sign. Certain where friction drives them, too."""
+    for joint in negative.tolist():
+        driven = sum(_friction(data, fit, joint, side) for side in data.sides) < 0.0
+        unit = "kg" if data.chain.prismatic[joint] else "kg m^2"
+        yield Doubt(
+            " and ".join(f"{side} torque" for side in data.sides),
+            (data.chain.joint_names[joint],),
+            f"its inertia is negative ({inertia[joint]:.3g} ± {std[joint]:.2g} {unit})"
+            + (", and its friction drives it" if driven else ""),
+            "a reversed sign of the torque or the position",
+            "`scale: -1` in the mapping of the import mends it",
+            driven,
+        )
+
+
+def _friction(data: Redundancy, fit: Fit, joint: int, side: str) -> float:
+    """Mean power [W] of a joint's friction of the links or of the drives."""
+    rows = [part for part in data.rows if part.side == side]
+    if not rows:
+        return 0.0
+    speed = np.concatenate([part.qd[:, joint] for part in rows])
+    sign = np.concatenate([part.sign[:, joint] for part in rows])
+    viscous, coulomb = (
+        fit.parameters[data.place(symbol, joint)]
+        for symbol in (("Fvl", "Fcl") if side == "joint" else ("Fvm", "Fcm"))
+    )
+    return float(np.mean(viscous * speed**2 + coulomb * speed * sign))
+
+
+def _acting(data: Redundancy, fit: Fit, inertia: Mapping[int, float]) -> dict[int, float]:
+    """Largest share of the inertia's torque in a joint's (rms), over its sides."""
+    found = dict.fromkeys(inertia, 0.0)
+    for side, joint in fit.rho:
+        if joint in found:
+            parts = [part for part in data.rows if part.side == side]
+            torque_rms = np.sqrt(np.mean([np.var(part.torque[:, joint]) for part in parts]))
+            speeding = np.sqrt(np.mean([np.mean(part.qdd[:, joint] ** 2) for part in parts]))
+            found[joint] = max(found[joint], float(abs(inertia[joint]) * speeding / max(torque_rms, 1e-300)))
+    return found
 
 
 def _of_motors(data: Redundancy) -> list[Doubt]:
@@ -440,15 +509,16 @@ def _of_motors(data: Redundancy) -> list[Doubt]:
     fit = motor.fit(normal)
     places = [motor.place("Ia", joint) for joint in joints]
     inertia, std = fit.parameters[places], motor.deviation(fit, normal, np.eye(motor.width)[places])
-    seen = std > 0.0
+    acting = _acting(motor, fit, dict(zip(joints, inertia.tolist(), strict=True)))
+    seen = (std > 0.0) & (np.array([acting[joint] for joint in joints]) > FLOOR)
     shares = np.clip(inertia[seen] / std[seen], -_MOST_BY_ONE, _MOST_BY_ONE)
     if np.sum(shares) <= _DRIVES * np.sqrt(max(len(shares), 1)):
         return []
     names = data.chain.joint_names
     listed = ", ".join(
         f"{names[joint]} {value:.3g} ± {deviation:.2g} kg m^2"
-        for joint, value, deviation in zip(joints, inertia, std, strict=True)
-        if value > 2.0 * deviation > 0.0
+        for joint, value, deviation, is_seen in zip(joints, inertia, std, seen, strict=True)
+        if is_seen and value > 2.0 * deviation
     )
     mend = (
         "import them as motor torques (`--torque motor`, or `motor_torque` in the mapping), so that the drives are in "
@@ -480,7 +550,11 @@ def _nominal(data: Redundancy, fit: Fit) -> list[Doubt]:
         return []
     channel = " and ".join(f"{side} torque" for side in data.sides)
     names = tuple(data.chain.joint_names[joint] for joint in slopes)
-    looks = unit_of(middle) if middle > 0.0 else "a reversed sign of all torques, or of all positions"
+    looks = (
+        unit_of(middle, torque=True)
+        if middle > 0.0
+        else "a reversed sign of all torques, or of all positions"
+    )
     seen = f"gravity is {middle:.3g} times that of the URDF's bodies"
     mend = "state unit and sign of the torques when importing, or correct the URDF's masses"
     certain = len(slopes) >= _SEVERAL and (middle < 0.0 or abs(np.log(middle)) > 2.0 * np.log(_NOMINAL))

@@ -58,14 +58,24 @@ def test_the_torque_error_is_that_of_the_worst_session_and_of_held_out_ones_wher
     )
 
 
-def test_lengths_of_turning_friction_are_told_without_exponents() -> None:
+@pytest.mark.parametrize(
+    ("lengths", "words"),
+    [
+        ({"A1": 2.04e-3, "A2": 0.104}, "of 2 drives turns over 2 to 100 mrad, in the model: "),
+        ({"A1": 2.04e-3}, "of one drive turns over 2 mrad, in the model: "),
+        ({"A1": 1e-5, "A2": 2e-5}, "of 2 drives stays at rest as it was, in the model: "),
+    ],
+)
+def test_lengths_of_turning_friction_are_told_without_exponents(
+    lengths: dict[str, float], words: str
+) -> None:
     turning = {
-        "length_rad": {"A1": 2.04e-3, "A2": 0.104},
+        "length_rad": lengths,
         "torque_error_percent": {"without": 5.2, "with": 4.9},
     }
     choice = {"chosen": "wls", "used": "wls", "candidates": [{"title": "wls", "held_back_percent": 1.0}]}
     told = dict(numbers_of({"sessions": [], "choice": choice | {"friction_turns": turning}}))["friction"]
-    assert told.startswith("of 2 drives turns over 2 to 100 mrad, in the model: ")
+    assert told.startswith(words)
 
 
 def test_a_bag_of_another_program_is_identified_and_not_recovered(tmp_path: Path) -> None:

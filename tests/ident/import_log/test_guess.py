@@ -236,6 +236,8 @@ def test_joints_at_rest_are_held_where_they_rest(arm: Path, tmp_path: Path) -> N
         (["t", *columns("q{k}"), *columns("tau{k}")], (T, 6e3 * Q, TAU), {}, "outside the limits .*A motor's angle"),
         (["t", *columns("q{k}")[:6], *columns("tau{k}")], (T, Q[:, :6], TAU), {"joints": JOINTS}, "6 columns for"),
         (["t", *columns("q{k}"), *columns("tau{k}")], (T * 1e5, Q, TAU), {}, None),
+        (["t", *columns("q{k}"), *columns("tau{k}")[:6]], (T, Q, TAU[:, :6]), {}, "6 columns of torque for 7"),
+        (["t", *columns("q{k}"), *columns("dq{k}"), *columns("tau{k}")], (T[::-1], Q, QD, TAU), {}, "t go back in "),
         (["t", *columns("q{k}")[:6], *columns("tau{k}")[:6]], (T, Q[:, :6], TAU[:, :6]), {}, "no serial arms with 6"),
     ],
 )  # fmt: skip
@@ -248,6 +250,12 @@ def test_what_cannot_be_told_is_said(
         return
     with pytest.raises((DataError, ConfigurationError), match=message):
         guess_mapping(path, arm, Known(**known))
+
+
+def test_a_column_of_times_with_a_step_back_is_left_out_with_the_reason(arm: Path, tmp_path: Path) -> None:
+    names = ["t", *columns("q{k}"), *columns("dq{k}"), *columns("tau{k}")]
+    path = write(tmp_path / "run.csv", names, np.where(np.arange(N) < 50, T, T - 0.3), Q, QD, TAU)
+    assert "; t goes back in row 51 and is not used" in str(guess_mapping(path, arm))
 
 
 @pytest.mark.parametrize(

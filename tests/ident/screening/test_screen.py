@@ -178,6 +178,13 @@ def test_the_reversed_side_is_told_from_the_right_one(pair: list[Session], side:
     assert (found.channel, found.certain, len(found.joints)) == (f"{side} torque", True, 7)
 
 
+@pytest.mark.parametrize("side", ["motor", "joint"])
+def test_the_reversed_side_of_the_last_joint_is_told_by_its_drive(pair: list[Session], side: str) -> None:
+    """No other torque tells the sign of the last one's; the friction of its drive does."""
+    (found,) = doubts(scaled(side, "effort", -1.0, "A6")(pair))
+    assert (found.channel, found.joints, found.certain) == (f"{side} torque", ("A6",), True)
+
+
 def test_both_sides_reversed_make_a_negative_inertia(pair: list[Session]) -> None:
     both = scaled("motor", "effort", -1.0)(scaled("joint", "effort", -1.0)(pair))
     assert any(doubt.certain and "negative" in doubt.seen for doubt in doubts(both))
@@ -251,6 +258,41 @@ def test_the_sign_of_a_single_joint_shows_by_its_inertia() -> None:
     (found,) = screen([recorded(-1.0)], alone)
     assert found.certain
     assert "negative" in found.seen
+
+
+@pytest.mark.parametrize(("rubs", "certain"), [(2.0, True), (0.0, False)])
+def test_the_sign_of_a_joint_that_shares_nothing_with_the_others_shows_by_its_inertia(
+    rubs: float, certain: bool
+) -> None:
+    """A spindle along a vertical axis and a column that turns about it."""
+    time, random = np.arange(0.0, 20.0, 0.004), np.random.default_rng(0)
+    phase = np.array([0.0, 2.0])
+    q = np.sin(1.1 * time[:, None] + phase) + 0.4 * np.sin(2.3 * time[:, None] + phase)
+    qd = np.gradient(q, 0.004, axis=0)
+    effort = np.array([5.0, 8.0]) * np.gradient(qd, 0.004, axis=0) + [0.0, 8.0 * 9.81]
+    effort += 0.05 * random.normal(size=q.shape) + rubs * np.sign(qd)
+    arm = Chain.from_table([{"name": "J1"}, {"name": "J2", "kind": "prismatic"}], gravity=(0.0, 0.0, -9.81))
+    stamps = np.rint(1e9 * time).astype(np.int64)
+    whole = session(rate_hz=250.0)
+
+    def recorded(sign: float) -> Session:
+        columns = replace(
+            whole.joint,
+            names=("J1", "J2"),
+            log_time=stamps,
+            publish_time=stamps,
+            sequence=np.arange(1, len(time) + 1),
+            position=q + 1e-5 * random.normal(size=q.shape),
+            velocity=np.zeros((len(time), 0)),
+            effort=effort * [1.0, sign],
+        )
+        return replace(whole, joint_names=("J1", "J2"), joint=columns, motor=None, phases=())
+
+    assert screen([recorded(1.0)], arm) == ()
+    (found,) = screen([recorded(-1.0)], arm)
+    assert (found.channel, found.joints, found.certain) == ("joint torque", ("J2",), certain)
+    assert "its inertia is negative (-8" in found.seen
+    assert "kg)" in found.seen
 
 
 def test_channels_that_contradict_themselves_are_named(pair: list[Session]) -> None:
@@ -349,6 +391,7 @@ def test_positions_that_are_a_copy_of_another_joints_are_told(pair: list[Session
         ("A2", "gain", 0.15),
         ("A4", "gain", -0.15),
         ("A2", "delay", 0.04),
+        ("A3", "delay", 0.016),
     ],
 )
 def test_a_position_with_a_small_error_is_told_with_its_size(
@@ -639,6 +682,11 @@ def test_a_message_says_channel_joint_sight_guess_and_remedy() -> None:
 )
 def test_factors_have_their_usual_causes(factor: float, words: str) -> None:
     assert words in unit_of(factor)
+
+
+def test_a_torque_is_no_angle() -> None:
+    assert unit_of(57.3, torque=True) == "a gain of 57.3"
+    assert "mNm" in unit_of(1000.0, torque=True)
 
 
 def jumping(where: Session, joint: int, size: float, sample: int = 2000) -> Session:
