@@ -454,8 +454,11 @@ def _reversed(
     data: Redundancy, fit: Fit, negative: NDArray[np.int64], inertia: Floats, std: Floats
 ) -> Iterator[Doubt]:
     """Single joints with a negative inertia: their torques and those of the others have nothing in common that would
-    tell their sign. Certain where friction drives them, too."""
+    tell their sign. Certain where friction drives them, too. A torque that bodies and friction hardly explain, such as
+    that of a light wrist with a cable, says nothing."""
     for joint in negative.tolist():
+        if max(rho for (_, own), rho in fit.rho.items() if own == joint) > AGREES:
+            continue
         driven = sum(_friction(data, fit, joint, side) for side in data.sides) < 0.0
         unit = "kg" if data.chain.prismatic[joint] else "kg m^2"
         yield Doubt(
