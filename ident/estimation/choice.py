@@ -29,11 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
+from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
 from ident.effects import SENSOR_GAIN, entry_of
 from ident.estimation.identify import (
+    EstimatorFactory,
     Identification,
     IdentificationSettings,
     Known,
@@ -45,11 +47,11 @@ from ident.estimation.mounting import Mounting, find_mounting, tilt_columns
 from ident.estimation.parts import beside, held_back_parts
 from ident.estimation.turning import Turning, friction_turning
 from ident.estimators.covariance import CovarianceSettings, effective_rows
-from ident.estimators.estimate import Estimate, chi_square_tail
+from ident.estimators.estimate import Estimate, Estimator, chi_square_tail
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.physical import BodyPrior, PhysicallyConsistent, cad_prior, lacking_bodies
 from ident.estimators.prior import Disagreement, MaximumAPosteriori, Prior
-from ident.estimators.problem import Problem
+from ident.estimators.problem import Nuisance, Problem
 from ident.rows.content import Recall
 from ident.rows.filters import half_width
 from ident.rows.sessions import require
@@ -108,7 +110,8 @@ class Choice(Tabular):
     candidates : in the order of preference. chosen : number of the winner. parts, block_s : of the held-back rows.
     excluded : candidates that the data do not permit, with the reason. disagreement : between the URDF's inertials
     and the data. advice : sentences for the report. mounting : the tilt of the base, if the winner has one.
-    gains : error of the joint torque sensor's scale by joint, value and standard deviation, if the winner has some.
+    gains : error of the joint torque sensor's scale by joint, value and standard deviation, if the winner has some;
+    gains_covariance : (k, k) of theirs.
     urdf_doubt : why the URDF's bodies are missing or look like placeholders, empty without doubt.
     used : the estimator taken instead of the winner; empty for the winner itself. turning : of the drives' friction,
     None where it turns at once.
@@ -123,6 +126,7 @@ class Choice(Tabular):
     advice: tuple[str, ...] = ()
     mounting: Mounting | None = None
     gains: dict[str, tuple[float, float]] = field(default_factory=dict)
+    gains_covariance: Floats = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     used: str = ""
     turning: Turning | None = None
     urdf_doubt: str = ""
@@ -231,7 +235,8 @@ def choose(
         essential=settings.essential,
         covariance=settings.covariance,
     )
-    final = replace(settled, estimator=estimator_factory(winner.estimator, **options))
+    factory = estimator_factory(winner.estimator, **options)
+    final = replace(settled, estimator=_beside_gains(factory, choice) if choice.gains else factory)
     sessions = [_calibrated(session, choice.gains) for session in sessions]
     if winner.tilt:
         # The prior as stated, however loose the winner's: bodies free of it absorb a part of the tilt. Placeholder
@@ -258,6 +263,44 @@ def choose(
 def _again(choice: Choice) -> Choice:
     """A choice for other sessions, without what was estimated from the first ones."""
     return replace(choice, mounting=None, turning=None)
+
+
+def _beside_gains(factory: EstimatorFactory, choice: Choice) -> EstimatorFactory:
+    """The estimator with the uncertainty of the sensors' gains in its covariance."""
+
+    def made(base: BaseSet, problem: Problem, covariance: CovarianceSettings) -> Estimator:
+        return _BesideGains(factory(base, problem, covariance), choice.gains, choice.gains_covariance)
+
+    return made
+
+
+@dataclass(frozen=True)
+class _BesideGains:
+    """An estimator of calibrated torques. gains : as of `Choice`. covariance : (k, k) of their errors."""
+
+    estimator: Estimator
+    gains: Mapping[str, tuple[float, float]]
+    covariance: Floats
+
+    @property
+    def needs_rank(self) -> bool:
+        """Whether the rows have to determine all parameters."""
+        return bool(getattr(self.estimator, "needs_rank", True))
+
+    def fit(self, problem: Problem) -> Estimate:
+        """Estimate the parameters of the problem."""
+        # Independent combinations of the gains: their common part, which the bodies take up, is known least.
+        power, vectors = np.linalg.eigh(self.covariance)
+        further = []
+        for k, (variance, vector) in enumerate(zip(power, vectors.T, strict=True)):
+            share = dict(zip(self.gains, vector.tolist(), strict=True))
+            columns = {
+                number: -share[group.joint] / (1.0 + self.gains[group.joint][0]) * group.target
+                for number, group in enumerate(problem.groups)
+                if group.side == "joint" and group.joint in share
+            }
+            further.append(Nuisance(f"sensor gains {k + 1}", float(np.sqrt(max(variance, 0.0))), columns))
+        return self.estimator.fit(replace(problem, nuisances=(*problem.nuisances, *further)))
 
 
 def _calibrated(session: Session, gains: Mapping[str, tuple[float, float]]) -> Session:
@@ -424,10 +467,12 @@ class _Comparison:
         )
         place = kinds.index(chosen)
         advice += self._worse_joints(candidates, squares, place)
-        readings = zip(chosen[3], *self._gains(chosen), strict=True) if chosen[3] else ()
+        values, spread = self._gains(chosen)
+        readings = zip(chosen[3], values, np.sqrt(np.diag(spread)), strict=True)
         return Choice(
             candidates, place, len(self.held), self.block_s, excluded, self._disagreement(), tuple(advice),
             gains={self.joints[g]: (float(value), float(std)) for g, value, std in readings},
+            gains_covariance=spread,
         )  # fmt: skip
 
     def _freed(self, kind: Kind, found: dict[Kind, Floats]) -> Kind:
@@ -523,17 +568,17 @@ class _Comparison:
         return chi_square_tail(square, 2) < _UPRIGHT
 
     def _gains(self, kind: Kind) -> tuple[Floats, Floats]:
-        """Errors of the sensors' scale of a candidate from all rows, and their standard deviations."""
+        """Errors (k,) of the sensors' scale of a candidate from all rows, and their covariance (k, k)."""
         values, covariance = self._solved(kind)
-        count = len(kind[3])
-        return values[-count:], np.sqrt(np.diag(covariance))[-count:]
+        own = slice(len(values) - len(kind[3]), None)
+        return values[own], covariance[own, own]
 
     def _gains_of(self, kind: Kind) -> tuple[int, ...]:
         """Sensors with an error of scale beyond chance, beside all others; none with a single sensor."""
         if len(self.joints) < 2:
             return ()
-        value, std = self._gains((*kind[:3], tuple(range(len(self.joints)))))
-        return tuple(np.flatnonzero(np.abs(value) > _SURE * std).tolist())
+        values, covariance = self._gains((*kind[:3], tuple(range(len(self.joints)))))
+        return tuple(np.flatnonzero(np.abs(values) > _SURE * np.sqrt(np.diag(covariance))).tolist())
 
     def _scores(
         self, used: NDArray[np.int64], weights: Floats, prior: Prior, physical: float | None = None

@@ -113,8 +113,9 @@ def estimate_from(
                      float(n_eff[number]))
         )  # fmt: skip
     covariances = {"textbook": plain or textbook(bread)}
+    by_class = weights if class_weights is None else class_weights
     if settings.kind != "textbook":
-        by_group = (weights if class_weights is None else class_weights)[list(problem.class_of_group)]
+        by_group = by_class[list(problem.class_of_group)]
         if coefficients is None:
             coefficients = [weight * e for weight, e in zip(by_group, residuals, strict=True)]
         if row_weights is None:
@@ -146,7 +147,7 @@ def estimate_from(
                 name: replace(c, matrix=c.matrix + offset) if name != "textbook" else c
                 for name, c in covariances.items()
             }
-    shared = _nuisance_covariance(problem, bread, weights, matrices)
+    shared = nuisance_covariance(problem, bread, by_class, matrices)
     if shared is not None:
         covariances = {name: replace(c, matrix=c.matrix + shared) for name, c in covariances.items()}
     return Estimate(
@@ -165,8 +166,8 @@ def estimate_from(
     )
 
 
-def _nuisance_covariance(
-    problem: Problem, bread: Floats, weights: Floats, matrices: Sequence[Floats] | None
+def nuisance_covariance(
+    problem: Problem, bread: Floats, weights: Floats, matrices: Sequence[Floats] | None = None
 ) -> Floats | None:
     """sum of (d chi / d quantity) std^2 (d chi / d quantity)^T over the nuisances, or None without any."""
     active = [nuisance for nuisance in problem.nuisances if nuisance.std > 0]

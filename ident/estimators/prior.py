@@ -22,6 +22,7 @@ from ident.estimators.least_squares import (
     class_variances,
     consumed_parameters,
     estimate_from,
+    nuisance_covariance,
     weighted_solution,
 )
 from ident.estimators.problem import Problem
@@ -297,7 +298,11 @@ class MaximumAPosteriori:
             converged=converged,
             notes=(f"prior standard deviations x {np.sqrt(scale):.3g} ({how})",),
         )
-        posterior = Covariance(bread, "posterior with the effective number of rows: holds if the prior does")
+        shared = nuisance_covariance(problem, bread, tempered)
+        posterior = Covariance(
+            bread if shared is None else bread + shared,
+            "posterior with the effective number of rows: holds if the prior does",
+        )
         return replace(
             estimate,
             covariance=posterior,

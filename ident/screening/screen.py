@@ -513,15 +513,17 @@ def _of_motors(data: Redundancy) -> list[Doubt]:
     places = [motor.place("Ia", joint) for joint in joints]
     inertia, std = fit.parameters[places], motor.deviation(fit, normal, np.eye(motor.width)[places])
     acting = _acting(motor, fit, dict(zip(joints, inertia.tolist(), strict=True)))
-    seen = (std > 0.0) & (np.array([acting[joint] for joint in joints]) > FLOOR)
+    # What no sensor would feel is no drive, however sure.
+    felt = np.array([acting[joint] for joint in joints]) > FLOOR
+    seen = std > 0.0
     shares = np.clip(inertia[seen] / std[seen], -_MOST_BY_ONE, _MOST_BY_ONE)
-    if np.sum(shares) <= _DRIVES * np.sqrt(max(len(shares), 1)):
+    if not felt.any() or np.sum(shares) <= _DRIVES * np.sqrt(max(len(shares), 1)):
         return []
     names = data.chain.joint_names
     listed = ", ".join(
         f"{names[joint]} {value:.3g} ± {deviation:.2g} kg m^2"
-        for joint, value, deviation, is_seen in zip(joints, inertia, std, seen, strict=True)
-        if is_seen and value > 2.0 * deviation
+        for joint, value, deviation, is_felt in zip(joints, inertia, std, felt, strict=True)
+        if is_felt and value > 2.0 * deviation > 0.0
     )
     mend = (
         "import them as motor torques (`--torque motor`, or `motor_torque` in the mapping), so that the drives are in "

@@ -11,7 +11,7 @@ import pytest
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
-from ident.estimation.choice import choose
+from ident.estimation.choice import _BesideGains, choose
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.parts import PARTS, beside, held_back_parts
 from ident.estimators import MaximumAPosteriori, Prior, Problem, RowGroup, WeightedLeastSquares
@@ -155,6 +155,13 @@ def test_a_joint_that_a_gain_explains_weighs_by_what_is_left():
     error, std = found.choice.gains["A3"]
     assert error == pytest.approx(0.08, abs=3.0 * std)
     assert std < 0.002
+    np.testing.assert_allclose(found.choice.gains_covariance, [[std**2]])
+    # The moment about A3 carries the uncertainty of its sensor.
+    place = found.base.names.index("MY4R")
+    plain = WeightedLeastSquares().fit(found.problem)
+    wide = _BesideGains(WeightedLeastSquares(), {"A3": (0.0, 0.05)}, np.array([[0.05**2]])).fit(found.problem)
+    added = np.sqrt(wide.std[place] ** 2 - plain.std[place] ** 2)
+    assert 0.01 * abs(plain.values[place]) < added < 0.05 * abs(plain.values[place])
 
 
 def test_healthy_sensors_get_no_gain():

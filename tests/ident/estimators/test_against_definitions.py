@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -36,6 +38,7 @@ from ident.estimators.covariance import (
     jackknife,
 )
 from ident.estimators.least_squares import class_variances
+from ident.estimators.problem import Nuisance
 from tests.ident.regression_problems import ar1, design, problem
 
 CHI = np.linspace(-2.0, 2.5, 12)
@@ -279,6 +282,18 @@ def test_a_posterior_is_the_weighted_mean_of_data_and_prior(strength: float) -> 
     np.testing.assert_allclose(estimate.std, np.sqrt(np.diag(np.linalg.inv(information))), rtol=2e-3)
     assert estimate.converged
     assert f"x {np.sqrt(strength):.3g} (stated)" in estimate.notes[0]
+
+
+def test_a_posterior_is_wider_by_the_effect_of_a_nuisance() -> None:
+    case, prior = noisy(samples=40), correlated_prior()
+    column = np.cos(0.3 * np.arange(len(case.groups[0].target)))
+    beside = replace(case, nuisances=(Nuisance("delay", 0.5, {0: column}),))
+    plain, wide = (MaximumAPosteriori(prior, 1.0).fit(one) for one in (case, beside))
+    weight = tempered(plain, case)[: len(column)]
+    shift = 0.5 * plain.covariance.matrix @ (case.groups[0].matrix.T * weight) @ column
+    np.testing.assert_allclose(
+        wide.covariance.matrix - plain.covariance.matrix, np.outer(shift, shift), rtol=1e-3, atol=1e-9
+    )
 
 
 def test_the_evidence_is_the_density_of_the_data() -> None:
