@@ -178,7 +178,7 @@ def _rows(
 class Normal:
     """Normal equations of the m classes, the torques' of the o parts.
 
-    matrix : G (m, p, p). mixed : B (m, o, p, n + 2). scatter, square : T (m, o, n + 2, n + 2) without the mean of the
+    matrix : G (m, p, p). mixed : B^T (m, o, n + 2, p). scatter, square : T (m, o, n + 2, n + 2) without the mean of the
     session, and S with it.
     """
 
@@ -290,32 +290,40 @@ class Redundancy:
 
     def matrix(self, rows: SampledRows) -> Floats:
         """Regressor (n, K, p) of one set of rows."""
-        n = self.chain.n
-        payloads, joint = self.payloads, "joint" in self.sides
-        rigid = rigid_regressor(self.chain, rows.q, rows.qd, rows.qdd)
-        first = _BODY * (n + len(payloads))
-        out = np.zeros((n, len(rows.q), self.width))
-        out[:, :, : _BODY * n] = rigid
-        if rows.payload is not None:
-            start = _BODY * (n + payloads.index(rows.payload))
-            out[:, :, start : start + _BODY] = rigid[:, :, -_BODY:]
-        for j in range(n):
-            if joint:
-                at = first + _JOINT * j
-                out[j, :, at], out[j, :, at + 1], out[j, :, at + 2] = rows.qd[:, j], rows.sign[:, j], 1.0
-            if rows.side == "motor":
-                at = first + n * _JOINT * joint + _MOTOR * j
-                out[j, :, at], out[j, :, at + 1] = rows.qdd[:, j], rows.qd[:, j]
-                out[j, :, at + 2], out[j, :, at + 3] = rows.sign[:, j], 1.0
-        if rows.side == "motor":
-            last = first + n * (_JOINT * joint + _MOTOR)
+        return self._columns([rows]).transpose(1, 2, 0)
+
+    def _columns(self, together: Sequence[SampledRows]) -> Floats:
+        """Columns (p, n, K) of the regressor of sets of rows of one side, one after the other."""
+        n, side = self.chain.n, together[0].side
+        q, qd, qdd, sign, coupled, slope = (
+            np.concatenate([getattr(rows, name) for rows in together])
+            for name in ("q", "qd", "qdd", "sign", "coupled", "slope")
+        )
+        out = np.zeros((self.width, n, len(q)))
+        rigid_regressor(self.chain, q, qd, qdd, out=out[: _BODY * n])
+        begin = 0
+        for rows in together:
+            here = slice(begin, begin := begin + len(rows.q))
+            if rows.payload is not None:
+                start = _BODY * (n + self.payloads.index(rows.payload))
+                out[start : start + _BODY, :, here] = out[_BODY * (n - 1) : _BODY * n, :, here]
+        first, each = _BODY * (n + len(self.payloads)), np.arange(n)
+        if "joint" in self.sides:
+            # Columns of joint j in the rows of joint j alone.
+            at = first + _JOINT * each
+            out[at, each], out[at + 1, each], out[at + 2, each] = qd.T, sign.T, 1.0
+            first += _JOINT * n
+        if side == "motor":
+            at = first + _MOTOR * each
+            out[at, each], out[at + 1, each], out[at + 2, each], out[at + 3, each] = qdd.T, qd.T, sign.T, 1.0
+            last = first + _MOTOR * n
             # One delay for the channel: an error of its time moves the torque by its slope.
-            out[:, :, last] = rows.slope.T
+            out[last] = slope.T
             for k, (a, b) in enumerate(self.couplings):
-                at = last + 1 + 3 * k
-                out[a, :, at], out[b, :, at] = rows.qdd[:, b], rows.qdd[:, a]
-                out[[a, b], :, at + 1] = rows.qd[:, a] + rows.qd[:, b]
-                out[[a, b], :, at + 2] = rows.coupled[:, k]
+                pair = last + 1 + 3 * k
+                out[pair, a], out[pair, b] = qdd[:, b], qdd[:, a]
+                out[pair + 1, [a, b]] = qd[:, a] + qd[:, b]
+                out[pair + 2, [a, b]] = coupled[:, k]
         return out
 
     def normal(self) -> Normal:
@@ -325,27 +333,28 @@ class Redundancy:
         place = {key: k for k, key in enumerate(key for key in classes if key not in self.silent)}
         width, parts = self.width, tuple(sorted({rows.part for rows in self.rows}))
         matrix = np.zeros((len(place), width, width))
-        mixed = np.zeros((len(place), len(parts), width, n + 2))
+        mixed = np.zeros((len(place), len(parts), n + 2, width))
         scatter, square = np.zeros((2, len(place), len(parts), n + 2, n + 2))
         means = self._means()
         for side in self.sides:
             rows = sorted((one for one in self.rows if one.side == side), key=lambda one: one.part)
             joints = [j for j in range(n) if (side, j) in place]
             at = [place[side, j] for j in joints]
-            regressor = np.concatenate([self.matrix(one) for one in rows], axis=1)[joints]
+            columns = self._columns(rows)
             moving = np.concatenate([one.moving for one in rows]).T[joints, :, None]
             seen = np.concatenate([_extended(one) for one in rows]) * moving
-            for k, own, weight in zip(at, regressor, moving, strict=True):
+            for k, joint, weight in zip(at, joints, moving, strict=True):
                 # A joint's torque has the bodies behind it and its own drive alone.
-                used = np.flatnonzero(own.any(axis=0))
-                part = own[:, used] * weight
-                matrix[k][np.ix_(used, used)] = part.T @ part
+                used = np.flatnonzero(columns[:, joint].any(axis=1))
+                part = columns[used, joint] * weight[:, 0]
+                matrix[k, used[:, None], used] = part @ part.T
             begin = 0
             for one in rows:
                 rest = slice(begin, begin := begin + len(one.q))
                 o, some = parts.index(one.part), seen[:, rest]
                 centred = some - means[side, one.record][joints, None] * moving[:, rest]
-                mixed[at, o] += _transposed(regressor[:, rest]) @ some
+                own = columns[:, joints, rest].transpose(1, 2, 0)
+                mixed[at, o] += _transposed(some) @ own
                 scatter[at, o] += _transposed(centred) @ centred
                 square[at, o] += _transposed(some) @ some
         return Normal(tuple(place), parts, matrix, mixed, scatter, square)
@@ -404,9 +413,8 @@ class Redundancy:
         reweighting, at most.
         """
         normal = self.normal() if normal is None else normal
-        maps = [[self.map_of(side, part)[joint] for part in normal.parts] for side, joint in normal.classes]
-        chosen = np.array(maps).reshape(-1, len(normal.parts), self.chain.n + 2)
-        mixed = np.einsum("kopn,kon->kp", normal.mixed, chosen)
+        chosen = self._maps(normal)
+        mixed = np.einsum("konp,kon->kp", normal.mixed, chosen)
         scatter, square = (
             np.einsum("kon,konm,kom->k", chosen, part, chosen) for part in (normal.scatter, normal.square)
         )
@@ -437,6 +445,12 @@ class Redundancy:
                 )
             )
         return min(fits, key=lambda fit: fit.score)
+
+    def _maps(self, normal: Normal) -> Floats:
+        """Rows (m, o, n + 2) of the maps: true torque of each class in each part."""
+        maps = {side: [self.map_of(side, part) for part in normal.parts] for side in self.sides}
+        found = [[one[joint] for one in maps[side]] for side, joint in normal.classes]
+        return np.array(found).reshape(-1, len(normal.parts), self.chain.n + 2)
 
     def gains(self, fit: Fit, normal: Normal) -> dict[Class, Gain]:
         """Gain of each class against its torque computed from the shared parameters.
