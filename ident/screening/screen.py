@@ -242,20 +242,18 @@ def _of_the_wrong_side(one: Explanation) -> Explanation:
     for side in data.sides:
         turned = turned.mapped(side, scale)
     fits = [data.fit(), turned.fit()]
-    inertias = [
-        _inertia(d.chain, _poses(d), _bodies(d, fit)) for d, fit in zip((data, turned), fits, strict=True)
-    ]
     if len(one.joints) == 1:
         # The other joints may not tell its sign; the difference of its torques is friction and inertia of the drive.
-        joint = one.joints[0]
-        first, second = (
-            _friction(d, fit, joint, "motor") for d, fit in zip((data, turned), fits, strict=True)
-        )
+        power = _friction(data, one.joints[0], ("motor",))
+        first, second = (float(power @ fit.parameters) for fit in fits)
         other = first < 0.0 < second
     elif one.factor < 0.0:
+        inertias = [
+            _inertia(d.chain, _poses(d), _bodies(d, fit)) for d, fit in zip((data, turned), fits, strict=True)
+        ]
         other = bool(np.sum(inertias[1] > 0.0) > np.sum(inertias[0] > 0.0))
     else:
-        slopes = [list(_gravity_slopes(d, d.fit()).values()) for d in (data, turned)]
+        slopes = [list(_gravity_slopes(d, fit).values()) for d, fit in zip((data, turned), fits, strict=True)]
         if not slopes[0] or not slopes[1] or data.chain.placeholder_masses():
             return replace(one, channel="motor torque against joint torque")
         ratios = [abs(float(np.median(values))) for values in slopes]
@@ -325,9 +323,13 @@ def _doubt(one: Explanation, sessions: Sequence[Session]) -> Doubt:
             seen = f"is {one.gain.value:.4g} ± {one.gain.std:.2g} times the torque computed from all other channels"
         strange = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
         certain = strange and one.gain.left < _LEFT
-        mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
-        if one.factor < 0.0 and len(one.mended.sides) == 1:
-            mend = f"check the sign of this channel and of the joint's position; {mend.partition('; ')[2]}"
+        either = one.factor < 0.0 and len(one.mended.sides) == 1
+        check = (
+            "the sign of this channel and of the joint's position"
+            if either
+            else "sign, unit and gain of this channel"
+        )
+        mend = f"check {check}; `scale` in the mapping of the import mends a known factor"
     elif one.parts and channel == "position":
         session = sessions[one.parts[0][0]].path.name
         seen = f"contradicts the torques and the other sessions; {better}"
@@ -447,11 +449,11 @@ def _physics(data: Redundancy, fit: Fit, normal: Normal) -> list[Doubt]:
             "`scale: -1` in the mapping of the import mends it",
         )
         return [Doubt(channel, names, f"the arm's inertia is negative ({listed})", looks, mend, True)]
-    return [*_reversed(data, fit, negative, inertia, std), *_nominal(data, fit)]
+    return [*_reversed(data, fit, normal, negative, inertia, std), *_nominal(data, fit)]
 
 
 def _reversed(
-    data: Redundancy, fit: Fit, negative: NDArray[np.int64], inertia: Floats, std: Floats
+    data: Redundancy, fit: Fit, normal: Normal, negative: NDArray[np.int64], inertia: Floats, std: Floats
 ) -> Iterator[Doubt]:
     """Single joints with a negative inertia: their torques and those of the others have nothing in common that would
     tell their sign. Certain where friction drives them, too. A torque that bodies and friction hardly explain, such as
@@ -459,7 +461,10 @@ def _reversed(
     for joint in negative.tolist():
         if max(rho for (_, own), rho in fit.rho.items() if own == joint) > AGREES:
             continue
-        driven = sum(_friction(data, fit, joint, side) for side in data.sides) < 0.0
+        power = _friction(data, joint, data.sides)
+        driven = float(power @ fit.parameters) < -_DEVIATIONS * float(
+            data.deviation(fit, normal, power[None])[0]
+        )
         unit = "kg" if data.chain.prismatic[joint] else "kg m^2"
         yield Doubt(
             " and ".join(f"{side} torque" for side in data.sides),
@@ -472,18 +477,17 @@ def _reversed(
         )
 
 
-def _friction(data: Redundancy, fit: Fit, joint: int, side: str) -> float:
-    """Mean power [W] of a joint's friction of the links or of the drives."""
-    rows = [part for part in data.rows if part.side == side]
-    if not rows:
-        return 0.0
-    speed = np.concatenate([part.qd[:, joint] for part in rows])
-    sign = np.concatenate([part.sign[:, joint] for part in rows])
-    viscous, coulomb = (
-        fit.parameters[data.place(symbol, joint)]
-        for symbol in (("Fvl", "Fcl") if side == "joint" else ("Fvm", "Fcm"))
-    )
-    return float(np.mean(viscous * speed**2 + coulomb * speed * sign))
+def _friction(data: Redundancy, joint: int, sides: Sequence[str]) -> Floats:
+    """Row (p,) of the mean power [W] of a joint's friction, that of the links and of the drives for their sides."""
+    row = np.zeros(data.width)
+    for side, viscous, coulomb in (("joint", "Fvl", "Fcl"), ("motor", "Fvm", "Fcm")):
+        parts = [part for part in data.rows if part.side == side] if side in sides else []
+        if parts:
+            speed = np.concatenate([part.qd[:, joint] for part in parts])
+            sign = np.concatenate([part.sign[:, joint] for part in parts])
+            row[data.place(viscous, joint)] = np.mean(speed**2)
+            row[data.place(coulomb, joint)] = np.mean(speed * sign)
+    return row
 
 
 def _acting(data: Redundancy, fit: Fit, inertia: Mapping[int, float]) -> dict[int, float]:
