@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -61,6 +61,7 @@ __all__ = [
     "effects_torque",
     "entry_of",
     "find_effect",
+    "in_force",
     "parameter_values",
     "sized",
     "summary_of",
@@ -218,21 +219,29 @@ def sized(entry: Mapping[str, Any], factor: float) -> Mapping[str, Any]:
     return entry if factor == 1.0 else {**entry, "parameters": values}
 
 
-def effects_torque(
-    entries: Iterable[Mapping[str, Any]], motion: ArmMotion, *, side: Side, measured: bool = False
-) -> Floats:
-    """Torque (N, n) [Nm] added to one side by the entries of a model's effects.
+def in_force(
+    entries: Iterable[Mapping[str, Any]], *, measured: bool = False
+) -> Iterator[tuple[Effect, int, dict[str, float], Any]]:
+    """Effect, joint (from 0), values and form of the entries that add to a torque, joint by joint.
 
-    measured : add the errors of the sensors to the physics. Events (a contact, a loosened payload) and delayed
-    channels are properties of a session, not of the arm, and are left out.
+    measured : with the errors of the sensors. Events (a contact, a loosened payload) and delayed channels are
+    properties of a session, not of the arm, and are left out.
     """
-    total = np.zeros_like(motion.q)
     for entry in entries:
         effect = find_effect(str(entry["cause"]))
         if effect.event or effect.side == "timing" or (effect.side == "sensor" and not measured):
             continue
         values = parameter_values(entry)
         for joint in entry["joints"] or [1]:
-            motor, link = effect.torque(motion, int(joint) - 1, values, entry.get("form"))
-            total += motor if side == "motor" else link if side == "joint" else motor - link
+            yield effect, int(joint) - 1, values, entry.get("form")
+
+
+def effects_torque(
+    entries: Iterable[Mapping[str, Any]], motion: ArmMotion, *, side: Side, measured: bool = False
+) -> Floats:
+    """Torque (N, n) [Nm] added to one side by the entries of a model's effects, see `in_force`."""
+    total = np.zeros_like(motion.q)
+    for effect, joint, values, form in in_force(entries, measured=measured):
+        motor, link = effect.torque(motion, joint, values, form)
+        total += motor if side == "motor" else link if side == "joint" else motor - link
     return total

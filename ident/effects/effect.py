@@ -456,12 +456,18 @@ class Effect(ABC):
     ) -> tuple[Floats, Floats]:
         """Torque (N, n) [Nm] of the effect in the motor torque and in the joint torque."""
         total = np.zeros((2, len(motion.time), motion.n))
-        columns = self.columns(motion, joint, self.shape_of(parameters, form))
-        for value, column in zip(self.coefficients_of(parameters), columns, strict=False):
+        for value, column in self.weighted(motion, joint, parameters, form):
             for side, part in enumerate(column.wide(joint, motion.n)):
                 if part is not None:
                     total[side] += value * part
         return total[0], total[1]
+
+    def weighted(
+        self, motion: ArmMotion, joint: int, parameters: Parameters, form: FormName = None
+    ) -> Iterator[tuple[float, Column]]:
+        """The coefficients with their columns, for a full set of parameter values."""
+        columns = self.columns(motion, joint, self.shape_of(parameters, form))
+        yield from zip(self.coefficients_of(parameters), columns, strict=False)
 
     def derivative(
         self, motion: ArmMotion, joint: int, parameters: Parameters, name: str, form: FormName = None

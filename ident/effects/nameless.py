@@ -8,7 +8,7 @@ motor), `qdd3` (its acceleration), `load3` (predicted joint torque), the factors
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -55,6 +55,13 @@ def _add_hats(place, out):  # type: ignore[no-untyped-def]
         out[k, knot + 1] = place[k] - knot
 
 
+def between_knots(value: Any, low: float, high: float, knots: Sequence[float]) -> Any:
+    """The function of a number or of (N,): `knots[k]` at the evenly spaced knot k, constant beyond the outer ones."""
+    place = (value - low) * ((KNOTS - 1) / (high - low))
+    rises = (step * np.clip(place - k, 0.0, 1.0) for k, step in enumerate(np.diff(knots)))
+    return sum(rises, np.float64(knots[0]))
+
+
 class _Term(Simulated):
     """A term in a simulated arm; the acceleration is the change of the motors' speed in a cycle."""
 
@@ -62,7 +69,7 @@ class _Term(Simulated):
         self.effect, self.joint, self.form = effect, joint, form
         self.values = {name: float(value) for name, value in values.items()}
         self.name, self.factor = _parts(str(form))
-        self.coefficients = np.array([self.values[f"value_{k + 1}"] for k in range(KNOTS)])
+        self.knots = [self.values[f"value_{k + 1}"] for k in range(KNOTS)]
         self.speed: Floats | None = None
         self.acceleration = np.zeros(0)
 
@@ -80,7 +87,7 @@ class _Term(Simulated):
         }
         kind, joint = _variable(self.name)
         low, high = self.values["low"], self.values["high"]
-        value = float((hats(signals[kind][joint : joint + 1], low, high) @ self.coefficients)[0])
+        value = float(between_knots(signals[kind][joint], low, high, self.knots))
         if self.factor.startswith("sign"):
             return value * float(np.sign(plant.motor_velocity[_factor_joint(self.factor)]))
         return value * float(plant.joint_torque[_factor_joint(self.factor)]) if self.factor else value
@@ -128,10 +135,10 @@ class _Nameless(Effect):
         """None: a nameless term is no candidate."""
         return ()
 
-    def torque(
+    def weighted(
         self, motion: ArmMotion, joint: int, parameters: Parameters, form: FormName = None
-    ) -> tuple[Floats, Floats]:
-        """Torque (N, n) [Nm] in the motor torque and in the joint torque."""
+    ) -> Iterator[tuple[float, Column]]:
+        """The function as a column of its own."""
         name, factor = _parts(str(form))
         kind, at = _variable(name)
         signals = {
@@ -140,15 +147,13 @@ class _Nameless(Effect):
             "qdd": motion.motor_acceleration,
             "load": motion.joint_torque,
         }
-        knots = np.array([parameters[f"value_{k + 1}"] for k in range(KNOTS)])
-        value = hats(signals[kind][:, at], parameters["low"], parameters["high"]) @ knots
+        knots = [parameters[f"value_{k + 1}"] for k in range(KNOTS)]
+        value = between_knots(signals[kind][:, at], parameters["low"], parameters["high"], knots)
         if factor.startswith("sign"):
             value = value * motion.direction[:, _factor_joint(factor)]
         elif factor:
             value = value * motion.joint_torque[:, _factor_joint(factor)]
-        both = np.zeros((2, len(value), motion.n))
-        both[0 if self.side == "motor" else 1, :, joint] = value
-        return both[0], both[1]
+        yield 1.0, Column(motor=value) if self.side == "motor" else Column(joint=value)
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """Range of the torque and of the variable."""

@@ -9,11 +9,14 @@ from __future__ import annotations
 import keyword
 import re
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from fri.errors import ConfigurationError
-from ident.formats.newton_euler import Expression, Graph, torques
+from ident.formats.newton_euler import FUNCTIONS, Expression, Graph, torques
 from ident.formats.standard import StandardModel
+from ident.formats.traced import torques_with_effects
 
 _LONGEST_INLINE = 3
 
@@ -23,33 +26,41 @@ class Program:
     """The inverse dynamics of a model as a graph: outputs by name, and their operations.
 
     outputs : n expressions of "tau_joint", "tau_motor" (or "tau_difference") and "gravity" (joint side).
+    missing : the effects of the model that are no function of the present motion.
     """
 
     model: StandardModel
     graph: Graph
     outputs: dict[str, list[Expression]]
     gravity: list[Expression]
+    missing: list[Mapping[str, Any]]
 
     @classmethod
     def of(cls, model: StandardModel) -> Program:
         """The inverse dynamics of `model`."""
         graph, n = Graph(), model.chain.n
         q, qd, qdd = ([graph.input(name, k) for k in range(n)] for name in ("q", "qd", "qdd"))
-        found = torques(graph, model, q, qd, qdd)
+        found, missing = torques_with_effects(graph, model, q, qd, qdd)
         rest = [graph.const(0.0)] * n
         gravity = torques(graph, model, q, rest, rest)["joint"]
         held = [
             expression - graph.const(float(model.drive[k, 3])) for k, expression in enumerate(gravity)
         ]  # without offl: the weight alone
         wanted = {f"tau_{side}": found[side] for side in model.sides}
-        return cls(model, graph, wanted, held if "joint" in model.sides or "motor" in model.sides else [])
+        has_bodies = "joint" in model.sides or "motor" in model.sides
+        return cls(model, graph, wanted, held if has_bodies else [], missing)
+
+    @property
+    def carried(self) -> tuple[Mapping[str, Any], ...]:
+        """The effects that are part of the torques."""
+        return tuple(entry for entry in self.model.effects if entry not in self.missing)
 
     @property
     def operations(self) -> dict[str, int]:
         """Number of multiplications, additions (subtractions) and function calls of the inverse dynamics."""
         flat = [expression for outputs in self.outputs.values() for expression in outputs]
         kinds = Counter(str(self.graph.nodes[index][0]) for index in self.graph.needed(flat))
-        calls = sum(kinds[name] for name in ("sin", "cos", "sign", "tanh", "deadband"))
+        calls = sum(kinds[name] for name in FUNCTIONS)
         return {"multiplications": kinds["mul"], "additions": kinds["add"] + kinds["sub"], "functions": calls}
 
 
@@ -148,9 +159,14 @@ _C = _Language(
     {
         "sin": "sin({0})",
         "cos": "cos({0})",
+        "exp": "exp({0})",
+        "abs": "fabs({0})",
         "sign": "sign_of({0})",
         "tanh": "tanh({0} / {1})",
         "deadband": "sign_beyond({0}, {1})",
+        "power": "pow({0}, {1})",
+        "max": "fmax({0}, {1})",
+        "min": "fmin({0}, {1})",
     },
     False,
 )
@@ -164,9 +180,14 @@ _NUMPY = _Language(
     {
         "sin": "np.sin({0})",
         "cos": "np.cos({0})",
+        "exp": "np.exp({0})",
+        "abs": "np.abs({0})",
         "sign": "np.sign({0})",
         "tanh": "np.tanh({0} / {1})",
         "deadband": "np.sign({0}) * (np.abs({0}) > {1})",
+        "power": "np.power({0}, {1})",
+        "max": "np.maximum({0}, {1})",
+        "min": "np.minimum({0}, {1})",
     },
     True,
 )
@@ -250,8 +271,16 @@ def _head(program: Program) -> list[str]:
         f"{count['functions']} functions.",
         f"Coulomb friction: {_COULOMB[model.coulomb_kind].format(model.coulomb_width)}.",
         *model.notes,
+        *_effects(program),
     ]
     return [_comment(line) for line in lines]
+
+
+def _effects(program: Program) -> list[str]:
+    """Lines on the effects of the model in the program, and on those that are not."""
+    held = list(dict.fromkeys(str(entry["cause"]) for entry in program.carried))
+    part = [f"With the model's effects: {', '.join(held)}."] if held else []
+    return [*part, *program.model.without(program.missing)]
 
 
 def _comment(text: str) -> str:

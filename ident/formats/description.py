@@ -69,7 +69,7 @@ def comment(model: StandardModel, notes: tuple[str, ...]) -> str:
         rows.append(
             f"The friction was estimated as a {law}; the simulator has a law of its own near zero speed."
         )
-    rows += [*model.notes, *notes]
+    rows += [*model.notes, *model.without(model.effects), *notes]
     return "\n     ".join(rows).replace("--", "- -") + " "
 
 

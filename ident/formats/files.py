@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fri.errors import ConfigurationError
-from ident.formats.code import to_c, to_numpy
+from ident.formats.code import Program, to_c, to_numpy
 from ident.formats.description import to_mjcf, to_urdf
 from ident.formats.read_back import check_c, check_mjcf, check_numpy, check_urdf
 from ident.formats.standard import StandardModel, standard_model
@@ -31,7 +31,8 @@ def export(
     name : of the arm in MJCF; first part of the names of the C functions. overwrite : replace existing files.
 
     Returns the exported numbers, with `title` and `notes`. URDF and MJCF need physically consistent bodies, the
-    nearest ones where the estimate is not; the notes say so.
+    nearest ones where the estimate is not; the notes say so. C and numpy hold those effects of the model that follow
+    from the present motion; the notes name the others.
     Each file is read back and computed with before it takes its name; C is compiled where there is a compiler.
     Raises ConfigurationError for an unknown ending, payload or model, and for a file that exists or cannot be
     written; nothing is written unless all endings are known. Raises DataError for a file of other torques than
@@ -52,20 +53,28 @@ def export(
             raise ConfigurationError(f"output {path} exists; choose another name or allow to overwrite it")
     source = as_model(model)
     plain = bodies = standard_model(source, payload=payload)
-    if any(path.suffix in (".urdf", ".xml") for path in paths):
+    descriptions = [path.name for path in paths if path.suffix in (".urdf", ".xml")]
+    programs = [path.name for path in paths if path.suffix not in (".urdf", ".xml")]
+    notes: list[str] = []
+    carried = source
+    if descriptions:
         bodies = standard_model(source, payload=payload, consistent=True)
+        notes += bodies.without(bodies.effects, ", ".join(descriptions))
+    if programs and source.effects:
+        program = Program.of(plain)
+        carried = replace(source, effects=program.carried)
+        notes += plain.without(program.missing, ", ".join(programs))
     writers = {
         ".urdf": lambda: to_urdf(bodies),
         ".xml": lambda: to_mjcf(bodies, name=name),
         ".c": lambda: to_c(plain, name),
         ".py": lambda: to_numpy(plain),
     }
-    notes: list[str] = []
     checks: dict[str, Callable[[str], object]] = {
         ".urdf": lambda text: check_urdf(text, bodies),
         ".xml": lambda text: check_mjcf(text, bodies),
-        ".c": lambda text: notes.append(check_c(text, source, payload, name)),
-        ".py": lambda text: check_numpy(text, source, payload),
+        ".c": lambda text: notes.append(check_c(text, carried, payload, name)),
+        ".py": lambda text: check_numpy(text, carried, payload),
     }
     for path in paths:
         write_checked(path, writers[path.suffix](), checks[path.suffix])

@@ -66,9 +66,9 @@ class Graph:
         return self._node(("input", name, position))
 
     def call(self, function: str, operand: Expression, *arguments: float) -> Expression:
-        """`sin`, `cos`, `sign`, `tanh` (of operand / argument) or `deadband` (sign, 0 up to the argument)."""
+        """A function of `FUNCTIONS`: of the operand, and of numbers such as the width of `tanh` and `deadband`."""
         if operand.value is not None:
-            return self.const(_CALLS[function](operand.value, *arguments))
+            return self.const(FUNCTIONS[function](operand.value, *arguments))
         return self._node((function, operand.index, *arguments))
 
     def neg(self, a: Expression) -> Expression:
@@ -179,13 +179,19 @@ def _sign(value: float) -> float:
     return float((value > 0.0) - (value < 0.0))
 
 
-_CALLS: dict[str, Callable[..., float]] = {
+FUNCTIONS: dict[str, Callable[..., float]] = {
     "sin": math.sin,
     "cos": math.cos,
+    "exp": math.exp,
+    "abs": abs,
     "sign": _sign,
     "tanh": lambda value, width: math.tanh(value / width),
     "deadband": lambda value, width: 0.0 if abs(value) <= width else _sign(value),
+    "power": math.pow,
+    "max": max,
+    "min": min,
 }
+"""The functions of the programs: of a value, and for some of a number."""
 
 
 def cross(a: Vector, b: Vector) -> Vector:
@@ -212,18 +218,18 @@ def torques(
     qdd: Sequence[Expression],
 ) -> dict[str, list[Expression]]:
     """Torque of every joint for each side of the model: "joint", "motor", "difference"."""
-    rigid = _rigid(graph, model, q, qd, qdd)
+    rigid = rigid_torque(graph, model, q, qd, qdd)
     joint, motor_only = [], []
     for k in range(model.chain.n):
         inertia, *friction = (graph.const(value) for value in model.drive[k])
         fvl, fcl, offl, fvm, fcm, offm = friction
-        sign = _speed_sign(graph, model, qd[k])
+        sign = speed_sign(graph, model, qd[k])
         joint.append(rigid[k] + (fvl * qd[k] + (fcl * sign + offl)))
         motor_only.append(inertia * qdd[k] + (fvm * qd[k] + (fcm * sign + offm)))
     for coupling in model.couplings:
         a, b = coupling.joints
         both = qd[a] + qd[b]
-        shared = graph.const(coupling.viscous) * both + graph.const(coupling.coulomb) * _speed_sign(
+        shared = graph.const(coupling.viscous) * both + graph.const(coupling.coulomb) * speed_sign(
             graph, model, both
         )
         inertia = graph.const(coupling.inertia)
@@ -233,19 +239,21 @@ def torques(
     return {"joint": joint, "motor": motor, "difference": motor_only}
 
 
-def _speed_sign(graph: Graph, model: StandardModel, speed: Expression) -> Expression:
+def speed_sign(graph: Graph, model: StandardModel, speed: Expression) -> Expression:
+    """The model's function for the sign of a speed."""
     if model.coulomb_kind == "sign":
         return graph.call("sign", speed)
     return graph.call(model.coulomb_kind, speed, model.coulomb_width)
 
 
-def _rigid(
+def rigid_torque(
     graph: Graph,
     model: StandardModel,
     q: Sequence[Expression],
     qd: Sequence[Expression],
     qdd: Sequence[Expression],
 ) -> list[Expression]:
+    """Torque of every joint for the rigid bodies alone."""
     chain, zero = model.chain, graph.const(0.0)
     omega: Vector = (zero, zero, zero)
     alpha: Vector = (zero, zero, zero)

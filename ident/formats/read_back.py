@@ -30,7 +30,7 @@ _COMPILE_S = 120.0
 
 
 def check_numpy(text: str, model: DynamicModel, payload: str | None) -> None:
-    """Raise DataError unless the numpy code gives the linear torque of the model on each side."""
+    """Raise DataError unless the numpy code gives the torque of the model on each side."""
     space: dict[str, Any] = {}
     try:
         exec(compile(text, "export", "exec"), space)
@@ -44,7 +44,7 @@ def check_numpy(text: str, model: DynamicModel, payload: str | None) -> None:
 
 
 def check_c(text: str, model: DynamicModel, payload: str | None, name: str) -> str:
-    """Compile the C code and raise DataError unless it gives the linear torque of the model on each side.
+    """Compile the C code and raise DataError unless it gives the torque of the model on each side.
 
     Returns a note for a computer without a C compiler, otherwise an empty text.
     """
@@ -136,7 +136,7 @@ def _compare_sides(
     states: tuple[Floats, Floats, Floats],
 ) -> None:
     for side, torque in found.items():
-        _compare(f"{side} torque", torque, model.linear_torque(*states, payload=payload, side=side), _CODE)
+        _compare(f"{side} torque", torque, model.torque(*states, payload=payload, side=side), _CODE)
 
 
 def _compare(what: str, found: Floats, wanted: Floats, tolerance: float) -> None:

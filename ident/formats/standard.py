@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +16,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, from_com
 from ident.dynamics.physical import Projection, project, reference_bodies
 from ident.dynamics.structure import Side
-from ident.effects import PRESLIDING
+from ident.effects import PRESLIDING, in_force
 from ident.model.dynamic_model import DynamicModel
 
 
@@ -37,6 +39,8 @@ class StandardModel:
     coulomb_kind, coulomb_width : the function for sign(qd).
     consistent : whether every link is physically consistent (needed for URDF and MJCF, not for code).
     title : one line for the head of a file.
+    effects : entries of a model's effects that add to its torques. loaded : whether the payload is mounted, or the
+    model has none. bodies : (n, 10) as the effects see them.
     """
 
     chain: Chain
@@ -49,6 +53,9 @@ class StandardModel:
     consistent: bool = False
     title: str = ""
     notes: tuple[str, ...] = field(default=())
+    effects: tuple[Mapping[str, Any], ...] = ()
+    loaded: bool = True
+    bodies: Floats = field(default_factory=lambda: np.zeros((0, 10)))
 
     def __post_init__(self) -> None:
         for name, width in (("inertial", 10), ("drive", 7)):
@@ -59,6 +66,24 @@ class StandardModel:
                 )
             values.setflags(write=False)
             object.__setattr__(self, name, values)
+
+    def without(self, entries: Sequence[Mapping[str, Any]], file: str = "this file") -> tuple[str, ...]:
+        """Notes on a file without some of the effects; none if it has all."""
+        if not entries:
+            return ()
+        joints: dict[str, list[str]] = {}
+        for entry in entries:
+            names = [self.chain.joint_names[int(joint) - 1] for joint in entry["joints"]]
+            joints.setdefault(str(entry["cause"]), []).extend(names)
+        named = ", ".join(cause + (f" ({', '.join(own)})" if own else "") for cause, own in joints.items())
+        missing = f"Effects of the model missing in {file}: {named}."
+        if set(joints) == {PRESLIDING.cause}:
+            return (missing,)
+        return (
+            missing,
+            "The parameters were estimated together with these effects; without them, a model identified "
+            "without effects predicts better.",
+        )
 
 
 _LINK, _BODY = len(PER_LINK), len(INERTIAL)
@@ -120,14 +145,6 @@ def standard_model(
     else:
         vector = np.zeros(structure.n_columns)
         vector[model.columns] = model.values
-    if model.effects:
-        notes = (*notes, f"Effects of the model missing in this file: {_named(model)}.")
-    if any(str(effect["cause"]) != PRESLIDING.cause for effect in model.effects):
-        notes = (
-            *notes,
-            "The parameters were estimated together with these effects; without them, a model identified "
-            "without effects predicts better.",
-        )
     title = f"{model.robot}, {'bare arm' if payload is None else f'payload {payload}'}"
     return StandardModel(
         chain=structure.chain,
@@ -140,6 +157,9 @@ def standard_model(
         consistent=consistent,
         title=title,
         notes=notes,
+        effects=tuple(entry for entry in model.effects if any(in_force([entry]))),
+        bodies=model.inertial(payload),
+        loaded=model.loaded(payload),
     )
 
 
@@ -229,15 +249,6 @@ def _torque_change(model: DynamicModel, vector: Floats) -> Floats:
         error = (matrix @ (vector - model.standard)).reshape(structure.chain.n, -1)
         total += np.mean(error**2, axis=1)
     return np.sqrt(total / (1 + len(structure.payloads)))
-
-
-def _named(model: DynamicModel) -> str:
-    """The effects of a model with their joints."""
-    joints: dict[str, list[str]] = {}
-    for effect in model.effects:
-        names = [model.structure.chain.joint_names[int(joint) - 1] for joint in effect["joints"]]
-        joints.setdefault(str(effect["cause"]), []).extend(names)
-    return ", ".join(cause + (f" ({', '.join(own)})" if own else "") for cause, own in joints.items())
 
 
 def _couplings(model: DynamicModel, vector: Floats) -> tuple[CoupledDrives, ...]:

@@ -183,6 +183,10 @@ class DynamicModel(Tabular):
             bodies[-1] += vector[_LINK * link : _LINK * link + _BODY]
         return bodies
 
+    def loaded(self, payload: str | None) -> bool:
+        """Whether effects of the payload act with this one mounted; always in a model without payloads."""
+        return payload is not None or not self.structure.payloads
+
     @property
     def remembers(self) -> bool:
         """Whether its torque may follow from the motion more than seconds ago."""
@@ -264,6 +268,7 @@ class DynamicModel(Tabular):
             motor_coulomb=drive["Fcm"],
             friction=friction,
             slip=self.structure.coulomb(qd),
+            loaded=self.loaded(payload),
         )
 
     def linear_torque(

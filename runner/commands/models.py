@@ -186,7 +186,8 @@ def export_command(
     .py    numpy inverse dynamics
 
     URDF and MJCF need physically consistent bodies. Unidentifiable parameters come from the arm's own URDF; an
-    inconsistent estimate is replaced by the nearest consistent body, with a note.
+    inconsistent estimate is replaced by the nearest consistent body, with a note. C and numpy also hold those effects
+    of an extended model that follow from the present motion.
 
     \b
     lwr-run export results/model.yaml lwr.urdf lwr.xml lwr.c lwr.py

@@ -120,21 +120,3 @@ def test_unsuitable_models_and_payloads_are_refused(truth_model: DynamicModel) -
     assert "tau_difference" in to_numpy(standard_model(difference))
     with pytest.raises(ConfigurationError, match="reference bodies have shape"):
         standard_model(truth_model, consistent=True, reference=np.zeros((2, 10)))
-
-
-def test_effects_that_are_left_out_are_named(truth_model: DynamicModel) -> None:
-    extended = replace(
-        truth_model,
-        effects=(
-            {
-                "cause": "stribeck",
-                "side": "motor",
-                "joints": [2],
-                "parameters": {
-                    "amplitude": {"value": 1.0, "std": 0.1, "unit": "Nm"},
-                    "velocity": {"value": 0.05, "std": 0.01, "unit": "rad/s"},
-                },
-            },
-        ),
-    )
-    assert "Effects of the model missing in this file: stribeck (A2)." in to_numpy(standard_model(extended))

@@ -207,7 +207,7 @@ def test_validate_and_export_take_the_extended_model(done: Done) -> None:
     told = lwr_run("validate", extended, str(done.folder / "unloaded.mcap"), "--allow-seen")
     assert "presliding_hysteresis" in told
     told = lwr_run("export", extended, str(done.folder / "extended.py"))
-    assert "Effects of the model missing in this file: presliding_hysteresis" in told
+    assert "Effects of the model missing in extended.py: presliding_hysteresis" in told
     model = read_model(extended)
     assert model.effects[0]["parameters"]["amplitude"]["std"] > 0.0
     assert model.std is not None
