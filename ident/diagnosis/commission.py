@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import (
@@ -73,6 +74,8 @@ _LATEST_S = 0.02
 _CHANNELS = ("motor", "joint")
 # Share of the factor of a stated stiffness within which a fit is at its end.
 _END = 1.05
+# Share of healthy sets with a row above the largest error of the healthy ones.
+_ABOVE = 0.05
 
 SlowTurns = NDArray[np.float64]
 """(2, longer distances, n): slowly reversing Coulomb friction [Nm], and its standard deviation."""
@@ -300,7 +303,7 @@ def commission(
         shown=shown,
         usual=usual_sizes(tables),
         compliance_std=known.compliance_std,
-        left={side: np.fmax.reduce([one[side] for one in left]) for side in left[0]},
+        left=_largest_left(left),
     )
 
 
@@ -489,6 +492,23 @@ def _left(
     bench = prepare_bench(arm, held, settings, reference, (), fit_compliance=False)
     nuisance = select(bench.dictionary, bench.evidence, settings, None).nuisance_rows
     return held_out(bench.evidence, nuisance).rms()
+
+
+def _largest_left(sets: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
+    """Largest rms (n,) by side that a further healthy set leaves: all its rows stay below in 19 of 20; of a single set
+    its own.
+
+    The logarithms scatter about the mean of their row, alike in all rows: two sets tell too little of one row alone.
+    """
+    logs = {side: np.log([one[side] for one in sets]) for side in sets[0]}
+    away = np.concatenate([(rows - rows.mean(axis=0)).ravel() for rows in logs.values()])
+    found = int(np.isfinite(away).sum())
+    rows, freedom = found // len(sets), found * (1.0 - 1.0 / len(sets))
+    if freedom < 1.0:
+        return dict(sets[0])
+    spread = np.sqrt(np.nansum(away**2) / freedom * (1.0 + 1.0 / len(sets)))
+    more = float(special.stdtrit(freedom, 1.0 - _ABOVE / rows)) * spread
+    return {side: np.exp(values.mean(axis=0) + more) for side, values in logs.items()}
 
 
 def _gains(bench: DiagnosisBench, nuisance: Sequence[Rows]) -> Floats:

@@ -73,8 +73,8 @@ class Reference:
     compliance from its scatter over the sets, None for a single one; 0 where no set differs from the first beyond
     chance, and half of a stated compliance that the sets do not tell. shown : mean information of the sets on each
     candidate, by shape of its grid: the fall of the chi-square for a unit of its coefficients. usual : size of each
-    candidate on the healthy arm. left : rms (n,) [Nm] by side of a held-out session of the set in which it is largest,
-    beside what differs from day to day; empty if unknown.
+    candidate on the healthy arm. left : largest rms (n,) [Nm] by side of a held-out session of a healthy set, beside
+    what differs from day to day; empty if unknown.
     """
 
     model: DynamicModel

@@ -419,7 +419,7 @@ def _gain(content: Plain, details: Plain, names: Sequence[str]) -> Part:
     is_named = is_extended(content)
     sessions = ", ".join((content.get("sessions") or {}).get("test") or [])
     both = bool(sessions) and "rows_base" in gain
-    usual = ["healthy days"] * any(row.get("healthy") is not None for row in measured.values())
+    usual = ["healthy, at most"] * any(row.get("healthy") is not None for row in measured.values())
     rows: list[Row] = []
     for side, errors in (gain.get("rows_base" if both else "test_rms_base") or {}).items():
         for k in range(len(errors or ())):

@@ -143,7 +143,7 @@ def test_the_gain_of_test_sessions_has_all_samples_first_and_then_the_rows() -> 
     assert list(told)[:5] == ["rms [Nm]", "base", "extended", "change %", "rows: noise"]
     told = statements(content, details(rows=[{**row, "healthy": 0.11, "test_rms_base": 0.2}]), NAMES)
     gain = next(part for part in told.parts if part.anchor == "gain")
-    assert gain.head[gain.head.index("rows: noise") + 1] == "healthy days"
+    assert gain.head[gain.head.index("rows: noise") + 1] == "healthy, at most"
     assert "0.1100" in map(str, gain.rows[1])
     table = [line for line in said.text().splitlines() if "avoidable %" in line or " motor  " in line]
     assert len(table) == 8
