@@ -80,7 +80,7 @@ def unit_of(factor: float, *, torque: bool = False) -> str:
 def explain(
     data: Redundancy, believed: Callable[[Explanation, int], bool]
 ) -> tuple[list[Explanation], Redundancy]:
-    """Explanations, the strongest first, and the mended rows.
+    """Explanations, the strongest first, and the mended rows, until these contradict themselves no more.
 
     believed : of an explanation and the number of classes, whether it gains enough.
     """
@@ -92,7 +92,19 @@ def explain(
             break
         found.append(best)
         data = best.mended
+        normal = data.normal()
+        if not contradicts(data, data.fit(normal), normal):
+            break
     return found, data
+
+
+def contradicts(data: Redundancy, fit: Fit, normal: Normal) -> bool:
+    """Whether a joint disagrees with the others, a gain is wrong, or a part of the data has an error of its own."""
+    return (
+        max(fit.rho.values()) > AGREES
+        or any(map(is_wrong, data.gains(fit, normal).values()))
+        or bool(part_errors(data, fit, normal))
+    )
 
 
 def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Explanation | None:

@@ -30,8 +30,7 @@ from ident.rows.filters import SignalSettings
 from ident.rows.sessions import payload_name, stated_mass
 from ident.screening.channels import check_channels, check_limits, dead
 from ident.screening.doubts import Doubt, settle
-from ident.screening.explanations import AGREES, Explanation, explain, is_wrong, unit_of
-from ident.screening.parts import part_errors
+from ident.screening.explanations import AGREES, Explanation, contradicts, explain, unit_of
 from ident.screening.positions import position_errors
 from ident.screening.redundancy import FLOOR, Class, Fit, Normal, Part, Redundancy
 from lwr_driver.session import Session, Sessions, as_sessions
@@ -199,8 +198,7 @@ def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> tuple[list
     fit = data.fit(normal)
     found: list[Doubt] = []
     agree = max(fit.rho.values()) <= AGREES
-    wrong = not agree or any(map(is_wrong, data.gains(fit, normal).values()))
-    if wrong or part_errors(data, fit, normal):
+    if contradicts(data, fit, normal):
         explanations, data = explain(data, _supported)
         explanations = [_of_the_wrong_label(_of_the_wrong_side(one), sessions) for one in explanations]
         data = explanations[-1].mended if explanations else data
