@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -60,11 +60,13 @@ def record_pair(
     periods: int = 2,
     cycle_ms: int = 4,
     settings: Mapping[str, Any] | None = None,
+    payloads: Sequence[str] = ("none", "paper_load"),
 ) -> list[Session]:
-    """A session of the bare arm and one with the payload, with one random motion and fresh noise."""
+    """A session of the bare arm and one with the payload, or those of `payloads`, with one random motion and fresh
+    noise."""
     motion = random_motion(seed, period_s, periods, 1e-3 * cycle_ms)
     sessions = []
-    for number, payload in enumerate(("none", "paper_load")):
+    for number, payload in enumerate(payloads):
         order = Order(
             motion,
             folder / f"{seed}_{payload}.mcap",

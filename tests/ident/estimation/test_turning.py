@@ -133,7 +133,7 @@ def test_a_few_seconds_tell_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_model_of_an_arm_with_presliding_predicts_reversals(tmp_path: Path) -> None:
     plant = {"robot.plant": {"type": "tests.hidden_physics.arm:HiddenArm", "options": {}}}
     fitted = record_pair(tmp_path, 41, period_s=10.0, settings=plant)
-    other, _ = record_pair(tmp_path, 42, period_s=10.0, settings=plant)
+    (other,) = record_pair(tmp_path, 42, period_s=10.0, settings=plant, payloads=("none",))
     chain = Chain.from_urdf(find("lwr4plus.urdf"))
     errors = {}
     for estimator in ("physical", AUTO):

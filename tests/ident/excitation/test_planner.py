@@ -59,6 +59,12 @@ def problem() -> PlanProblem:
 
 
 @pytest.fixture(scope="module")
+def brief(problem: PlanProblem) -> PlanProblem:
+    """The same with a motion of half the length and fewer coefficients, for what any motion shows."""
+    return replace(problem, motion=replace(problem.motion, period_s=10.0, harmonics=3))
+
+
+@pytest.fixture(scope="module")
 def solved(problem: PlanProblem) -> ExcitationPlan:
     return plan(problem)
 
@@ -106,8 +112,8 @@ def test_seed_and_counts_decide_not_the_number_of_processes(
     np.testing.assert_array_equal(again.sample(3.3).q, solved.sample(3.3).q)
 
 
-def test_the_search_runs_on_a_dask_cluster(problem: PlanProblem) -> None:
-    small = replace(problem, search=Search(seed=3, starts=2, hops=0, jobs=-1))
+def test_the_search_runs_on_a_dask_cluster(brief: PlanProblem) -> None:
+    small = replace(brief, search=Search(seed=3, starts=2, hops=0, jobs=-1))
     alone = plan(replace(small, search=replace(small.search, jobs=1)))
     with (
         distributed.Client(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None),
@@ -117,12 +123,12 @@ def test_the_search_runs_on_a_dask_cluster(problem: PlanProblem) -> None:
     np.testing.assert_array_equal(spread.sample(3.3).q, alone.sample(3.3).q)
 
 
-def test_independent_searches_are_those_of_their_seeds_and_the_best_one_counts(problem: PlanProblem) -> None:
+def test_independent_searches_are_those_of_their_seeds_and_the_best_one_counts(brief: PlanProblem) -> None:
     few = Search(seed=3, starts=1, hops=0)
-    alone = [plan(replace(problem, search=replace(few, seed=seed))) for seed in (3, 4)]
+    alone = [plan(replace(brief, search=replace(few, seed=seed))) for seed in (3, 4)]
     heard: list[Progress] = []
     together = [
-        plan(replace(problem, search=replace(few, searches=2, jobs=jobs)), heard.append) for jobs in (1, 2)
+        plan(replace(brief, search=replace(few, searches=2, jobs=jobs)), heard.append) for jobs in (1, 2)
     ]
     best = min(alone, key=lambda one: one.objectives[CONDITION])
     for found in together:
@@ -145,21 +151,21 @@ def test_the_spread_of_searches_says_whether_another_confirms_the_best() -> None
     )
 
 
-def test_progress_counts_up_and_only_improves(problem: PlanProblem) -> None:
+def test_progress_counts_up_and_only_improves(brief: PlanProblem) -> None:
     heard: list[Progress] = []
-    plan(replace(problem, search=Search(seed=3, starts=2, hops=2, lanes=1)), heard.append)
+    plan(replace(brief, search=Search(seed=3, starts=2, hops=2, lanes=1)), heard.append)
     assert [event.stage for event in heard if event.done == 0] == ["starts", "hops", "polish"]
     best = [event.best for event in heard if event.best is not None]
     assert best == sorted(best, reverse=True)
     assert heard[-1].done == heard[-1].total == 1
 
 
-def test_interruption_returns_the_best_so_far_and_says_so(problem: PlanProblem) -> None:
+def test_interruption_returns_the_best_so_far_and_says_so(brief: PlanProblem) -> None:
     def interrupt(event: Progress) -> None:
         if event.stage == "starts" and event.done == 1:
             raise KeyboardInterrupt
 
-    found = plan(problem, interrupt)
+    found = plan(brief, interrupt)
     assert found.check.ok
     assert found.provenance["interrupted"] is True
 
@@ -167,7 +173,7 @@ def test_interruption_returns_the_best_so_far_and_says_so(problem: PlanProblem) 
         raise KeyboardInterrupt
 
     with pytest.raises(OperatorError, match="before any motion was found"):
-        plan(problem, at_once)
+        plan(brief, at_once)
 
 
 def test_a_quick_polish_still_ends_inside_every_limit(problem: PlanProblem, solved: ExcitationPlan) -> None:
@@ -323,13 +329,13 @@ def test_a_payload_too_heavy_to_hold_is_refused_with_joint_and_torque(
         plan(replace(problem, knowledge=Knowledge(file=str(heavy)), workspace=Workspace(radius_m=0.6)))
 
 
-def test_obstacles_of_the_cell_are_avoided(problem: PlanProblem, tmp_path: Path) -> None:
+def test_obstacles_of_the_cell_are_avoided(brief: PlanProblem, tmp_path: Path) -> None:
     cell = tmp_path / "cell.yaml"
     cell.write_text(
         "schema_version: 1\nname: tight\nboxes:\n"
         "  - {name: cabinet, size_m: [0.4, 2.0, 1.0], centre_m: [0.75, 0.0, 0.5]}\n"
     )
-    found = plan(replace(problem, cell=str(cell), search=Search(seed=5, starts=2, hops=0)))
+    found = plan(replace(brief, cell=str(cell), search=Search(seed=5, starts=2, hops=0)))
     cabinet = Box("cabinet", (0.4, 2.0, 1.0), (0.75, 0.0, 0.5))
     assert Cell.load(str(cell)).boxes == (cabinet,)
     assert found.check.ok
@@ -378,8 +384,8 @@ def test_table_and_report_name_what_they_show(problem: PlanProblem, solved: Exci
 
 
 @pytest.mark.slow
-def test_trade_off_gives_motions_within_their_bounds(problem: PlanProblem) -> None:
-    assembled = assemble(problem)
+def test_trade_off_gives_motions_within_their_bounds(brief: PlanProblem) -> None:
+    assembled = assemble(brief)
     criteria = assembled.criteria
     limits = [np.log(45.0), np.log(60.0)]
     points = trade_off(assembled, criteria.rsd_mean, criteria.condition, limits, starts=1, hops=0)

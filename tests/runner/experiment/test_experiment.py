@@ -141,7 +141,7 @@ def test_a_payload_that_is_not_there_is_noticed_before_anything_moves(tmp_path: 
 def test_an_aborted_experiment_goes_on_at_the_unfinished_motion(tmp_path: Path) -> None:
     stop = [{"command": "emergency_stop", "when": "moving", "occurrence": 5, "after_cycles": 200}]
     settings = {"fri.period_ms": 5, "schedule": stop}
-    file = experiment_file(tmp_path, emulator_settings=settings)
+    file = experiment_file(tmp_path, emulator_settings=settings, identification={"model": 1})
     broken = run("experiment", str(file), "--yes", "--out", str(tmp_path / "out"))
     assert broken.code == 5, broken.text
     assert "drives" in broken.text
@@ -185,7 +185,8 @@ def test_a_validation_needs_an_estimate(tmp_path: Path, sessions: list[object], 
 
 @pytest.mark.slow
 def test_motor_torques_from_the_controllers_trace(tmp_path: Path) -> None:
-    file = experiment_file(tmp_path, motor_torque={"source": "trace_file"})
+    sessions = [{"name": "loaded", "payload": LOAD}]
+    file = experiment_file(tmp_path, motor_torque={"source": "trace_file"}, sessions=sessions)
     done = run("experiment", str(file), "--yes", "--out", str(tmp_path / "out"))
     assert done.code == 0, done.text
     session = read_session(tmp_path / "out" / "loaded.mcap")

@@ -45,7 +45,9 @@ def hidden(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """A short run with a hidden effect."""
     place = tmp_path_factory.mktemp("hidden")
     motion = {"period_s": 6.0, "harmonics": 3, "periods": 2, "seed": 3}
-    file = experiment_file(place, excitation=motion, sessions=[{"name": "unloaded"}])
+    file = experiment_file(
+        place, excitation=motion, sessions=[{"name": "unloaded"}], identification={"model": 1}
+    )
     return run("experiment", str(file), "--yes", "--hide", "3", "--out", str(place / "out"))
 
 

@@ -312,6 +312,7 @@ def test_a_run_that_failed_is_called_bad_and_still_has_a_report(finished: Path, 
 
 def test_figures_and_tables_for_a_paper_are_written(finished: Path, tmp_path: Path) -> None:
     folder = copy(finished, tmp_path / "run")
+    (folder / "unloaded.mcap").unlink()
     command = [
         "report",
         str(folder),
