@@ -280,9 +280,12 @@ class Evidence:
         self._free = None
         if self.drawn:
             self._free = self._fit(gram, target, with_prior=False)
-        self._held = [
+        held = [
             self._fit(gram - g, target - t) for g, t in zip(self._part_gram, self._part_target, strict=True)
         ]
+        self._held = Fit(np.array([fit.values for fit in held]), np.array([fit.inverse for fit in held]))
+        left = self._part_gram @ self._held.values[:, :, None]
+        self._part_moment = self._part_target - left[:, :, 0]
 
     @property
     def drawn(self) -> bool:
@@ -420,20 +423,17 @@ class Evidence:
         """Score of columns in the rows of `keys` from their products with all present columns."""
         base, own, target = products.sums
         whole = base.sum(axis=0), own.sum(axis=0), target.sum(axis=0)
-        projection, inner, moment = _schur(whole, self.full, ridge)
+        schur = _schur((whole[0][None], whole[1][None], whole[2][None]), self.full, ridge)
+        (projection,), (inner,), (moment,), (sound,) = schur
         k = products.own.shape[1]
-        if inner is None:
+        if not sound:
             return Score(-np.inf, 0.0, np.zeros(k), 0.0, lambda: (np.eye(k), 0), 1.0)
         coefficients = inner @ moment
         fitted = float(moment @ coefficients)
         gain = fitted
         if fitted > _NO_EVIDENCE:
-            gain = 0.0
-            pulled = whole[0], whole[1] + pull * np.eye(k), whole[2] + pull
-            for part in range(len(self._held)):
-                mine = base[part], own[part], target[part]
-                rest = pulled[0] - mine[0], pulled[1] - mine[1], pulled[2] - mine[2]
-                gain += self._held_gain(mine, rest, part, ridge)
+            rest = whole[0] - base, whole[1] + pull * np.eye(k) - own, whole[2] + pull - target
+            gain = self._held_gain(products.sums, rest, ridge)
         rows = sum(self._independent[key] for key in keys)
         if self.prior is not None and self.compared and fitted > _NO_EVIDENCE:
             changed = self.full.values - projection @ coefficients
@@ -467,19 +467,15 @@ class Evidence:
         gain = score.fitted - penalty if np.isfinite(score.gain) else -np.inf
         return replace(score, gain=gain, chance=p)
 
-    def _held_gain(self, mine: _Sums, rest: _Sums, part: int, ridge: float) -> float:
-        """Fall of the chi-square on a part of the motion, the columns fitted on the rest."""
-        fit = self._held[part]
-        projection, inner, moment = _schur(rest, fit, ridge)
-        if inner is None:
-            return 0.0
-        c = inner @ moment
+    def _held_gain(self, mine: _Sums, rest: _Sums, ridge: float) -> float:
+        """Fall of the chi-square on each part of the motion, the columns fitted on the rest; the sum of all parts."""
+        projection, inner, moment, _ = _schur(rest, self._held, ridge)
+        cross, own, target = mine
+        c = inner @ moment[:, :, None]
         change = -(projection @ c)
-        gram, (cross, own, target) = self._part_gram[part], mine
-        base_moment = self._part_target[part] - gram @ fit.values
-        own_moment = target - cross @ fit.values
-        linear = 2.0 * (change @ base_moment + c @ own_moment)
-        square = change @ gram @ change + 2.0 * (c @ cross @ change) + c @ own @ c
+        own_moment = target[:, :, None] - cross @ self._held.values[:, :, None]
+        linear = 2.0 * (np.sum(change[:, :, 0] * self._part_moment) + np.sum(c * own_moment))
+        square = np.sum(change * (self._part_gram @ change)) + np.sum(c * (2.0 * (cross @ change) + own @ c))
         return float(linear - square)
 
     def _prior_penalty(self, values: Floats) -> float:
@@ -509,9 +505,9 @@ class Evidence:
         found = {}
         for side, rows in self.nominal.rows.items():
             out = np.full(rows.target.shape, np.nan)
-            for part, fit in zip(self.parts, self._held, strict=True):
+            for part, values in zip(self.parts, self._held.values, strict=True):
                 mine = (part > 0.0)[self._block[side]]
-                out[mine] = rows.target[mine] - self.predicted(side, fit.values, mine)
+                out[mine] = rows.target[mine] - self.predicted(side, values, mine)
             found[side] = np.where(rows.valid & ~rows.test[:, None], out, np.nan)
         return found
 
@@ -613,27 +609,28 @@ def _sums(parts: Floats, values: Floats) -> Floats:
     return (parts @ values.reshape(len(values), -1)).reshape(len(parts), *values.shape[1:])
 
 
-def _schur(products: _Sums, fit: Fit, ridge: float) -> tuple[Floats, Floats | None, Floats]:
-    """Projection on the base (P, k), inverse of the Schur complement (k, k), and product with the residual (k,) of
-    columns with the products base (k, P), own (k, k) and target (k,)."""
+def _schur(products: _Sums, fit: Fit, ridge: float) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+    """Projection on the base (m, P, k), inverse of the Schur complement (m, k, k), and product with the residual (m, k)
+    of columns with the products base (m, k, P), own (m, k, k) and target (m, k) in each of m sets of rows.
+
+    Last (m,), whether the columns are something of their own beside the base; the inverse is zero elsewhere.
+    """
     cross, own, target = products
-    projection = fit.inverse @ cross.T
+    projection = fit.inverse @ cross.transpose(0, 2, 1)
     inner = own - cross @ projection
-    if len(own) == 1:
+    power, left = np.einsum("mkk->mk", own), np.einsum("mkk->mk", inner)
+    sound = ((power > 0.0) & (left >= _LEAST_LEFT * power)).all(axis=1)
+    moment = target - (cross @ fit.values[..., None])[:, :, 0]
+    eye, at = np.eye(power.shape[1]), sound[:, None, None]
+    root = np.sqrt(np.where(sound[:, None], left + ridge * power, 1.0))
+    both = root[:, :, None] * root[:, None, :]
+    if len(eye) == 1:
         # Most groups are one column.
-        power, left = float(own[0, 0]), float(inner[0, 0])
-        if power <= 0.0 or left < _LEAST_LEFT * power:
-            return projection, None, np.zeros(1)
-        return projection, np.array([[1.0 / (left + ridge * power)]]), target - cross @ fit.values
-    size = np.diag(own).copy()
-    if np.any(size <= 0.0) or np.any(np.diag(inner) < _LEAST_LEFT * size):
-        return projection, None, np.zeros(len(own))
-    inner = inner + ridge * np.diag(size)
-    root = np.sqrt(np.diag(inner))
-    scaled = inner / np.outer(root, root)
-    if np.linalg.eigvalsh(scaled)[0] < 1e-9:
-        return projection, None, np.zeros(len(own))
-    return projection, np.linalg.inv(scaled) / np.outer(root, root), target - cross @ fit.values
+        return projection, at / both, moment, sound
+    scaled = np.where(at, (inner + ridge * power[:, :, None] * eye) / both, eye)
+    sound = sound & (np.linalg.eigvalsh(scaled)[:, 0] >= 1e-9)
+    at = sound[:, None, None]
+    return projection, at * np.linalg.inv(np.where(at, scaled, eye)) / both, moment, sound
 
 
 def _widened(sandwich: Floats, independent: Floats) -> Floats:
