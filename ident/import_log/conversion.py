@@ -31,6 +31,9 @@ MOST_MISSING = 0.5
 """Largest share of rows without one of their values; the rest is no recording of the motion."""
 # Share of the motion that marks may leave out unasked: without it standard deviations grow by 5 %.
 _LOST = 0.1
+# Distance of stamps from their grid, as a share of its step, by the rounding of decimal numbers; least samples that
+# show an even rate.
+_OFF_GRID, _EVEN = 0.01, 100
 
 
 @dataclass(frozen=True)
@@ -429,11 +432,11 @@ def _nanoseconds(
     times = whole.astype(np.int64) * 10**9 + np.rint((clock - whole) * 1e9).astype(np.int64)
     steps = np.diff(times)
     if base.equal == "spread" and (steps == 0).any() and (steps > 0).any():
-        notes.append(
-            f"{place.rpartition(': `')[2].rstrip('`'):<15} {int((steps == 0).sum())} samples share the time of the one "
-            "before and are spread evenly up to the next time"
-        )
-        times = _spread(times)
+        what, count = place.rpartition(": `")[2].rstrip("`"), int((steps == 0).sum())
+        said = f"{what:<15} {count} samples share the time of the one before and are spread evenly"
+        even = _even(times)
+        times, how = (_spread(times), "up to the next time") if even is None else even
+        notes.append(f"{said} {how}")
         steps = np.diff(times)
     backwards = np.flatnonzero(steps <= 0)
     if len(backwards):
@@ -448,6 +451,24 @@ def _nanoseconds(
             f"times must increase ({len(backwards)} such rows); {advice}, or import without it by `rate_hz`"
         )
     return times
+
+
+def _even(times: NDArray[np.int64]) -> tuple[NDArray[np.int64], str] | None:
+    """Even times of samples whose stamps are rounded, and what to say of them: the stamps lie on a grid, and the even
+    times within a step of it. None for others, such as those with a hole."""
+    steps = np.diff(times)
+    grain = int(steps[steps > 0].min())
+    number = np.arange(len(times))
+    if len(times) < _EVEN or (steps < 0).any():
+        return None
+    if np.any(np.abs(steps - grain * np.rint(steps / grain)) > _OFF_GRID * grain):
+        return None
+    period, first = np.polyfit(number, (times - times[0]).astype(np.float64), 1)
+    if np.ptp(times - times[0] - period * number) > (1.0 + _OFF_GRID) * grain:
+        return None
+    start = max(int(times[0]) + round(float(first)), min(int(times[0]), 0))
+    how = f"{period * 1e-6:.3g} ms apart: the stamps are rounded to {grain * 1e-6:.4g} ms"
+    return start + np.rint(period * number).astype(np.int64), how
 
 
 def _spread(times: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -73,8 +73,8 @@ class TimeBase:
     column : name or number (from 1) of a column, or name of an array; kept as it is, jitter included.
     unit : of the column. rate_hz : of a recording without a time column.
     zero : "start" if the column counts from a moment of its own, "unix" if it counts from 1970-01-01 UTC.
-    equal : samples with one and the same time, from a clock of coarse steps: "refuse" them, or "spread" them evenly
-        up to the next time.
+    equal : samples with one and the same time, from a clock of coarse steps: "refuse" them, or "spread" them evenly,
+        over the whole recording if its stamps are rounded, else up to the next time.
     """
 
     column: Name | _Number | None = None

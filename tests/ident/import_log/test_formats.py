@@ -216,6 +216,19 @@ def test_equal_stamps_are_refused_with_advice_or_spread_on_request(tmp_path: Pat
     assert any(re.fullmatch(r"position +3 samples share the time .*", note) for note in report.notes)
 
 
+def test_rounded_stamps_of_even_samples_give_even_times_unless_samples_are_lost(tmp_path: Path) -> None:
+    spread, even = mapping(time=PLAIN["time"] | {"equal": "spread"}), np.arange(400) * 5e-3
+    report, session = imported(tmp_path, write_csv(tmp_path, 400, t=np.round(even, 2)), spread)
+    np.testing.assert_allclose(np.diff(session.joint.log_time), 5e6, atol=2e4)
+    assert report.holes == 0
+    assert any("5 ms apart: the stamps are rounded to 10 ms" in note for note in report.notes)
+    gap = np.delete(even, slice(200, 240))
+    (tmp_path / "gap").mkdir()
+    report, session = imported(tmp_path / "gap", write_csv(tmp_path / "gap", 360, t=np.round(gap, 2)), spread)
+    assert np.diff(session.joint.log_time).max() > 0.15e9
+    assert not any("rounded" in note for note in report.notes)
+
+
 @pytest.mark.parametrize(
     ("step", "hint"), [(10.0, "is the `unit` of `time` `ms`?"), (5.0, "`ms`"), (0.002, "")]
 )
