@@ -475,7 +475,8 @@ def observed(
         made = [make(session, payload, signals=settings.signals) for session, payload in pairs]
         made = apart_in_time(with_delays(made, pairs, settings.signals, make))
         for warning in (text for one in made for text in one.prepared.warnings) if first else ():
-            logger.warning("%s", warning)
+            # The result holds them; here they precede an error.
+            logger.info("%s", warning)
         prepared, problems = [one.prepared for one in made], [one.problem for one in made]
         instruments = [one.instruments for one in made if one.instruments is not None]
         _every_joint_moves(prepared, chain)
