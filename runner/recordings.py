@@ -86,10 +86,11 @@ def read_recordings(
     """Sessions from paths of any kind, in their order.
 
     folder : for `NAME.mapping.yaml` and the session logs of recordings that need a mapping. The first of these gives
-        the columns of all. Raises ConfigurationError without a URDF, or without a confirmation.
+        the columns of all that have them; others get a mapping of their own. Raises ConfigurationError without a URDF,
+        or without a confirmation.
     """
     from ident.dynamics.session_chain import recorded_rests
-    from ident.import_log import Guess, Known, guess_mapping, import_log, read_recording
+    from ident.import_log import Known, guess_mapping, import_log, read_recording
     from ident.import_log.bag import bag_files
     from ident.import_log.tables import unpacked
     from lwr_driver.session import read_session
@@ -124,13 +125,7 @@ def read_recordings(
         _same_rests(guess.mapping.held or {}, guess_mapping(other, urdf, known).mapping.held or {}, other)
     _confirm(guess, yes)
     folder.mkdir(parents=True, exist_ok=True)
-    mapping = folder / f"{unpacked(foreign[0]).stem}.mapping.yaml"
-    if mapping.exists() and not mapping.read_text(encoding="utf-8").startswith(Guess.HEAD):
-        raise ConfigurationError(
-            f"{mapping} exists and was not guessed; use it with `lwr-run import`, or remove it"
-        )
-    mapping.write_text(guess.text, encoding="utf-8")
-    write(f"{mapping}\n")
+    _write_mapping(guess, folder / f"{unpacked(foreign[0]).stem}.mapping.yaml")
     names = dict(zip(foreign, _names(foreign), strict=True))
     sessions = []
     for path in paths:
@@ -139,9 +134,36 @@ def read_recordings(
             continue
         target = folder / f"{names[path]}.mcap"
         _clear(target)
-        write(f"{import_log(guess.mapping, path, target)}\n")
+        try:
+            report = import_log(guess.mapping, path, target)
+        except DataError as error:
+            own = _of_other_columns(path, guess, lambda other: guess_mapping(other, urdf, known), error)
+            _confirm(own, yes)
+            _write_mapping(own, folder / f"{names[path]}.mapping.yaml")
+            report = import_log(own.mapping, path, target)
+        write(f"{report}\n")
         sessions.append(read_session(target, status=False))
     return sessions
+
+
+def _of_other_columns(path: Path, first: Guess, guessed: Callable[[Path], Guess], error: DataError) -> Guess:
+    """The guess of a recording that the columns of the first do not fit. Raises `error` if its names tell no others."""
+    try:
+        own = guessed(path)
+    except DataError:
+        raise error from None
+    if own.mapping == first.mapping or set(own.mapping.joints) != set(first.mapping.joints):
+        raise error
+    return own
+
+
+def _write_mapping(guess: Guess, file: Path) -> None:
+    if file.exists() and not file.read_text(encoding="utf-8").startswith(guess.HEAD):
+        raise ConfigurationError(
+            f"{file} exists and was not guessed; use it with `lwr-run import`, or remove it"
+        )
+    file.write_text(guess.text, encoding="utf-8")
+    write(f"{file}\n")
 
 
 def _same_rests(first: Mapping[str, float], other: Mapping[str, float], path: Path) -> None:

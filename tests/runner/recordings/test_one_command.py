@@ -12,13 +12,14 @@ import pytest
 from click.testing import CliRunner, Result
 from mcap_ros2.writer import Writer
 
-from fri.errors import ConfigurationError
+from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
 from ident.model.model_file import read_model
 from lwr_driver.session import read_session
 from lwr_driver.session.messages import JOINT_STATE
 from runner.cli import main
 from runner.estimation import announced
+from runner.recordings import read_recordings
 from tests.ident.stock_panda import JOINTS, stock_panda
 
 RATE, SECONDS = 100.0, 16.0
@@ -220,3 +221,17 @@ def test_a_folder_with_a_split_bag_is_one_recording(lab: Path, tmp_path: Path) -
     np.testing.assert_array_equal(session.joint.effort, whole.joint.effort)
     assert (session.path, session.joint_names) == (folder, ("panda_finger_joint2", *JOINTS))
     assert np.ptp(np.diff(whole.joint.log_time)) < 1000
+
+
+def test_a_second_table_with_other_names_gets_a_mapping_of_its_own(lab: Path, tmp_path: Path) -> None:
+    head, _, rows = (lab / "two.csv").read_text().partition("\n")
+    other = tmp_path / "other.csv"
+    other.write_text(head.replace("dq", "vel_").replace("q", "pos_").replace("tau", "effort_") + "\n" + rows)
+    words = {"urdf": lab / "arm.urdf", "folder": tmp_path, "yes": True}
+    logs = read_recordings((lab / "one.csv", other), **words)
+    same = read_recordings((lab / "two.csv",), **words)[0]
+    np.testing.assert_array_equal(logs[1].joint.effort, same.joint.effort)
+    assert "pos_1" in (tmp_path / "other.mapping.yaml").read_text()
+    other.write_text(head.replace("tau", "x") + "\n" + rows)
+    with pytest.raises(DataError, match="no column 'tau1'"):
+        read_recordings((lab / "one.csv", other), **words)
