@@ -1,4 +1,4 @@
-"""Rows that two logs share to the last bit: a copy under another name, at other times, or a part of a log.
+"""Rows that two logs share, to the last bit or to four digits: a copy under another name or at other times, or a part.
 
 A row has a number, and a log is known by its smallest numbers: they are a fair sample of its rows (Broder, 1997), small
 enough for a model file.
@@ -6,38 +6,74 @@ enough for a model file.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.dynamics.parameters import Floats
 from lwr_driver.session import Session
 
 Numbers = NDArray[np.uint64]
 
 # Share of the rows of two logs from which they are one recording.
 SAME_ROWS = 0.2
+ROUNDED = 1e-4
+"""Largest change of a value by rounding, as a share of its column's range: four digits."""
+# Width of the cells in which equal rows are sought, over that change.
+_CELL = 10.0
 # Numbers that stand for a log; least rows in motion that stand for all.
 _MARKS, _MOVING = 64, 100
 
 
 def row_numbers(session: Session) -> Numbers:
     """Sorted numbers of 64 bits of the rows in motion, equal for rows with equal positions and torques."""
+    columns = _columns(session)
+    found, moving = _numbers(columns), np.ones(len(columns[0]), dtype=bool)
+    moving[:1] = False
+    for column in columns:
+        moving[1:] &= column[1:] != column[:-1]
+    return np.unique(found[moving] if moving.sum() > _MOVING else found)
+
+
+def _columns(session: Session) -> list[Floats]:
+    """Positions and torques (n,) of the joints; the motors' torques where there are no others."""
     sides = [session.joint.position, session.joint.effort]
     if session.motor is not None and not session.joint.effort.size:
         sides = [session.motor.effort]
-    count = len(sides[0])
-    found, moving = np.zeros(count, dtype=np.uint64), np.ones(count, dtype=bool)
-    moving[:1] = False
-    for values in sides:
-        for column in values.T:
-            # The finaliser of splitmix64 (Steele, Lea and Flood, 2014).
-            bits = np.ascontiguousarray(column).view(np.uint64) ^ (found * np.uint64(0x9E3779B97F4A7C15))
-            bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-            bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-            found = bits ^ (bits >> np.uint64(31))
-            moving[1:] &= column[1:] != column[:-1]
-    return np.unique(found[moving] if moving.sum() > _MOVING else found)
+    return [column for values in sides for column in values.T]
+
+
+def _numbers(columns: Sequence[Floats]) -> Numbers:
+    """Numbers (n,) of rows of columns (n,), by the finaliser of splitmix64 (Steele, Lea and Flood, 2014)."""
+    found = np.zeros(len(columns[0]), dtype=np.uint64)
+    for column in columns:
+        bits = np.ascontiguousarray(column).view(np.uint64) ^ (found * np.uint64(0x9E3779B97F4A7C15))
+        bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        found = bits ^ (bits >> np.uint64(31))
+    return found
+
+
+def shared_but_for_rounding(a: Session, b: Session) -> float:
+    """Share of the rows of the shorter log that are in the other to four digits of each column's range.
+
+    Two measurements of one motion differ by the noise of all sensors, which is more.
+    """
+    sides = _columns(a), _columns(b)
+    if len(sides[0]) != len(sides[1]):
+        return 0.0
+    scales = [ROUNDED * float(np.ptp(column)) for column in sides[0]]
+    moving = [k for k, scale in enumerate(scales) if scale > 0.0]
+    if not moving:
+        return 0.0
+    # Wide cells, so that few rows are rounded into the next one.
+    cells = [_numbers([np.floor(own[k] / (_CELL * scales[k])) + 0.0 for k in moving]) for own in sides]
+    _, first, second = np.intersect1d(cells[0], cells[1], return_indices=True)
+    alike = np.ones(len(first), dtype=bool)
+    for k in moving:
+        alike &= np.abs(sides[0][k][first] - sides[1][k][second]) <= scales[k]
+    return float(np.count_nonzero(alike)) / min(len(np.unique(own)) for own in cells)
 
 
 def shared(a: Numbers, b: Numbers) -> float:

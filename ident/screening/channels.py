@@ -24,7 +24,7 @@ from ident.rows.data_quality import (
     run_bounds,
     stuck_at,
 )
-from ident.rows.shared_rows import SAME_ROWS, row_numbers, shared
+from ident.rows.shared_rows import ROUNDED, SAME_ROWS, row_numbers, shared, shared_but_for_rounding
 from ident.screening.doubts import Doubt
 from lwr_driver.session import JointColumns, Session
 from lwr_driver.session.spool import column
@@ -74,8 +74,14 @@ def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
 
 def check_limits(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts by the limits in the URDF: a channel is wrong, seldom clear how."""
-    limits = joint_limits(chain)
-    return [doubt for s in sessions for doubt in (*_limits(s, limits), *_pace(s, limits))]
+    limits, found = joint_limits(chain), list[Doubt]()
+    for session in sessions:
+        beyond = list(_limits(session, limits))
+        # A position in another unit is too fast as well.
+        named = {name for doubt in beyond if doubt.channel == "position" for name in doubt.joints}
+        rest = {name: limit for name, limit in limits.items() if name not in named}
+        found += [*beyond, *_pace(session, rest)]
+    return found
 
 
 def joint_limits(chain: Chain) -> dict[str, dict[str, float]]:
@@ -119,12 +125,14 @@ def _torques(session: Session) -> Iterator[tuple[str, JointColumns]]:
 def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
     numbers = {id(session): row_numbers(session) for session in sessions} if len(sessions) > 1 else {}
     for a, b in combinations(sessions, 2):
-        share = shared(numbers[id(a)], numbers[id(b)])
+        share, how = shared(numbers[id(a)], numbers[id(b)]), ""
+        if share <= SAME_ROWS:
+            share, how = shared_but_for_rounding(a, b), ", rounded otherwise"
         uid = a.metadata.get("uid", "")
         alike = f" and the uid {uid}" if uid and uid == b.metadata.get("uid", "") else ""
         names = f"{a.path.name} and {b.path.name}"
         if share > SAME_ROWS:
-            seen = f"{names} hold the same samples ({100 * share:.0f} %){alike}"
+            seen = f"{names} hold the same samples ({100 * share:.0f} %{how}){alike}"
             yield Doubt(
                 "log", (), seen, "one log given twice", "give each log once; a copy is no new data", True
             )
@@ -243,17 +251,18 @@ def _dead(sessions: Sequence[Session]) -> Iterator[Doubt]:
 
 
 def _copied(session: Session) -> Iterator[Doubt]:
-    """Torques of several joints equal to the last bit, as two sensors never are, in every sample or a long part of
-    them; or positions in every sample. Positions of a simulation may be, if its motion asks for them, or if all joints
-    go the same way."""
+    """Torques of several joints equal but for rounding, as two sensors never are, in every sample, or to the last bit
+    in a long part of them; or positions to the last bit in every sample. Positions of a simulation may be, if its
+    motion asks for them, or if all joints go the same way."""
     for channel, columns in _torques(session):
-        whole = _alike(columns.effort)
+        whole = _alike(columns.effort, ROUNDED)
         for joints in whole:
-            yield _copies(session, channel, joints, certain=True)
+            yield _copies(session, channel, joints, certain=True, where="to four digits in every sample")
         times = np.asarray((columns.log_time - session.joint.log_time[:1]) * 1e-9, dtype=np.float64)
         for joints, span in _alike_in_part(columns.effort, times):
             if not any(set(joints) <= set(some) for some in whole):
-                yield _copies(session, channel, joints, certain=True, where=_spans(times, [span]))
+                where = f"to the last bit {_spans(times, [span])}"
+                yield _copies(session, channel, joints, certain=True, where=where)
     for joints in _alike(session.joint.position):
         if len(joints) == session.joint.position.shape[1]:
             continue
@@ -267,17 +276,17 @@ def _copied(session: Session) -> Iterator[Doubt]:
 
 
 def _both_sides(session: Session) -> Iterator[Doubt]:
-    """Motor torques equal to the last bit to the joint torques, as no two sensors are."""
+    """Motor torques equal to the joint torques but for rounding, as no two sensors are."""
     joint, motor = session.joint, session.motor
     if motor is None or motor.effort.shape != joint.effort.shape:
         return
     same = [
         k
         for k in range(joint.effort.shape[1])
-        if np.ptp(own := column(motor.effort, k)) > 0.0 and np.array_equal(own, column(joint.effort, k))
+        if np.ptp(own := column(motor.effort, k)) > 0.0 and _equal(own, column(joint.effort, k), ROUNDED)
     ]
     if same:
-        seen = "is the joint torque to the last bit in every sample"
+        seen = "is the joint torque to four digits in every sample"
         looks = "one column taken for both sides"
         mend = (
             "import the side that was measured only, or leave the motor torques aside (Model 1, `--model 1`)"
@@ -286,14 +295,24 @@ def _both_sides(session: Session) -> Iterator[Doubt]:
         yield Doubt("motor torque", names, seen, looks, mend, True, session.path.name)
 
 
-def _alike(values: Floats) -> list[list[int]]:
-    """Groups of columns that change and are equal."""
-    groups: dict[bytes, list[int]] = {}
+def _alike(values: Floats, share: float = 0.0) -> list[list[int]]:
+    """Groups of columns that change and are equal within a share of their range."""
+    groups: list[list[int]] = []
     for joint in range(values.shape[1]):
         own = column(values, joint)
-        if np.ptp(own) > 0.0:
-            groups.setdefault(content(own), []).append(joint)
-    return [joints for joints in groups.values() if len(joints) > 1]
+        if not np.ptp(own) > 0.0:
+            continue
+        same = [group for group in groups if _equal(own, column(values, group[0]), share)]
+        if same:
+            same[0].append(joint)
+        else:
+            groups.append([joint])
+    return [joints for joints in groups if len(joints) > 1]
+
+
+def _equal(own: Floats, other: Floats, share: float) -> bool:
+    """Whether values (n,) are equal within a share of their range."""
+    return bool(np.max(np.abs(own - other)) <= share * float(np.ptp(own)))
 
 
 def _alike_in_part(values: Floats, times: Floats) -> Iterator[tuple[list[int], tuple[int, int]]]:
@@ -317,10 +336,15 @@ def _alike_in_part(values: Floats, times: Floats) -> Iterator[tuple[list[int], t
 
 
 def _copies(
-    session: Session, channel: str, joints: Sequence[int], *, certain: bool, where: str = "in every sample"
+    session: Session,
+    channel: str,
+    joints: Sequence[int],
+    *,
+    certain: bool,
+    where: str = "to the last bit in every sample",
 ) -> Doubt:
     names = tuple(session.joint_names[joint] for joint in joints)
-    seen = f"read the same to the last bit {where}"
+    seen = f"read the same {where}"
     looks, mend = "one column taken for several joints", "give each joint its own column when importing"
     return Doubt(channel, names, seen, looks, mend, certain, session.path.name)
 

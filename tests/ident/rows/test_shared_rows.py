@@ -7,7 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.rows.shared_rows import SAME_ROWS, from_marks, marks, row_numbers, seen_before, shared
+from ident.rows.shared_rows import (
+    SAME_ROWS,
+    from_marks,
+    marks,
+    row_numbers,
+    seen_before,
+    shared,
+    shared_but_for_rounding,
+)
 from lwr_driver.session import Session
 from tests.ident import estimation_arm as arm
 
@@ -45,6 +53,22 @@ def test_another_recording_of_the_motion_shares_none(log: Session) -> None:
     assert shared(row_numbers(log), row_numbers(again)) == 0.0
     assert not seen_before(again, [from_marks(marks(log))])
     assert not seen_before(log, [])
+    assert shared_but_for_rounding(log, again) == 0.0
+
+
+def rounded(session: Session, digits: int) -> Session:
+    """The session with positions and torques to some decimals."""
+    joint = session.joint
+    values = {name: np.round(getattr(joint, name), digits) for name in ("position", "effort")}
+    return replace(session, joint=replace(joint, **values))
+
+
+def test_a_copy_or_a_part_with_rounded_values_shares_most_rows(log: Session) -> None:
+    for digits in (4, 6):
+        copy = rounded(cut(log, 1000, 3000), digits)
+        assert shared(row_numbers(log), row_numbers(copy)) < SAME_ROWS
+        assert shared_but_for_rounding(log, copy) > 0.5
+        assert shared_but_for_rounding(copy, log) > 0.5
 
 
 def test_marks_are_a_fair_sample(log: Session) -> None:

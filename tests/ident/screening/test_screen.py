@@ -30,7 +30,7 @@ from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
 from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
-from ident.screening.channels import check_channels
+from ident.screening.channels import check_channels, check_limits
 from ident.screening.doubts import Doubt, explaining, settle
 from ident.screening.explanations import unit_of
 from ident.screening.positions import position_errors
@@ -84,6 +84,14 @@ def test_a_wrong_channel_is_an_error_with_its_name(pair, change, channel, joints
     found = [doubt for doubt in doubts(change(pair)) if doubt.certain]
     assert (found[0].channel, found[0].joints) == (channel, joints)
     assert words in str(found[0])
+
+
+def test_a_position_in_another_unit_says_nothing_of_the_time(pair: list[Session]) -> None:
+    degrees = scaled("joint", "position", 180.0 / np.pi, "A4")(pair[:1])
+    assert [(doubt.channel, doubt.joints) for doubt in check_limits(degrees, chain())] == [
+        ("position", ("A4",))
+    ]
+    assert "time" in {doubt.channel for doubt in check_limits(paced(0.05)(degrees), chain())}
 
 
 M, L = ("motor", "effort"), ("joint", "effort")
@@ -322,8 +330,11 @@ def test_a_torque_that_is_a_copy_of_another_joints_is_an_error(pair: list[Sessio
     (found,) = screen([pair[0], copied], chain())
     assert (found.channel, found.joints, found.session) == (f"{side} torque", ("E1", "A4"), "loaded.mcap")
     assert found.certain
+    effort[:, 4] = np.round(effort[:, 2], 3)
+    rounded = check_channels([replace(pair[1], **{side: replace(columns, effort=effort)})], chain())
+    assert [doubt.joints for doubt in rounded] == [found.joints]
     # Two dead sensors are no copies, nor are torques equal but for one sample.
-    effort[17, 4] += 1e-9
+    effort[17, 4] += 0.01 * np.ptp(effort[:, 4])
     assert screen([pair[0], replace(pair[1], **{side: replace(columns, effort=effort)})], chain()) != (found,)
     effort[:, [2, 4]] = 0.0
     silent = check_channels([replace(pair[1], **{side: replace(columns, effort=effort)})], chain())
@@ -734,12 +745,12 @@ def test_motor_torques_that_are_a_copy_of_the_joint_torques_are_named(pair: list
     copied = replace(pair[0], motor=replace(joint, topic=motor.topic))
     (found,) = screen([copied], chain())
     assert (found.channel, found.joints, found.certain) == ("motor torque", chain().joint_names, True)
-    assert found.seen == "is the joint torque to the last bit in every sample"
+    assert found.seen == "is the joint torque to four digits in every sample"
     assert "`--model 1`" in found.mend
     # The joint torques are as good as before.
     assert screen([copied], chain(), motor=False) == ()
     effort = joint.effort.copy()
-    effort[:, 1:] += 0.01
+    effort[:, 1:] += 1.0
     (found,) = screen([replace(copied, motor=replace(joint, effort=effort))], chain())
     assert found.joints == chain().joint_names[:1]
 
