@@ -25,7 +25,7 @@ from ident.rows.data_quality import (
     stuck_at,
 )
 from ident.rows.shared_rows import ROUNDED, SAME_ROWS, row_numbers, shared, shared_but_for_rounding
-from ident.screening.doubts import Doubt
+from ident.screening.doubts import LATE_S, MEND_TIME, Doubt
 from lwr_driver.session import JointColumns, Session
 from lwr_driver.session.spool import column
 
@@ -39,6 +39,8 @@ _COMMON, _SPREAD = 0.03, 0.25
 # Blocks of the comparison with the velocity: least samples, least time [s]; least movement of a joint [rad or m].
 _BLOCK, _BLOCK_S, _MOVED = 5, 0.05, 0.05
 _CORRELATED = 0.9
+# Standard deviations of a delay of positions against velocities, beyond which it is told.
+_SURE = 5.0
 # Velocities over rad/s in other units.
 _SPEED_UNITS = {180.0 / np.pi: "deg/s for rad/s", 30.0 / np.pi: "revolutions per minute for rad/s"}
 # Overshoot of a limit by calibration, over which a doubt is raised, and share of the samples left out as outliers.
@@ -579,29 +581,13 @@ def _lag(columns: JointColumns) -> int:
 
 
 def _velocity(session: Session) -> Iterator[Doubt]:
-    """Velocities against the differences of the positions, by means over blocks: both are exact there."""
+    """Velocities against the differences of the positions."""
     joint, name = session.joint, session.path.name
-    if not joint.velocity.shape[1] or len(joint) < 100:
+    blocks = _speeds(joint)
+    if blocks is None:
         return
-    clock = joint.publish_time if np.ptp(joint.publish_time) > 0 else joint.log_time
-    time = (clock - clock[0]) * 1e-9
-    size = max(_BLOCK, int(np.ceil(_BLOCK_S / max(float(np.median(np.diff(time))), 1e-9))))
-    places = np.arange(0, len(time) - 1, size)
-    if len(places) < 20:
-        return
-    sums = np.vstack([np.zeros(joint.velocity.shape[1]), np.cumsum(joint.velocity, axis=0)])
-    # The trapezoidal mean of the velocity over a block is the difference of its positions.
-    ends = places[1:]
-    inner = (
-        sums[ends + 1] - sums[places[:-1]] - 0.5 * (joint.velocity[ends] + joint.velocity[places[:-1]])
-    ) / size
-    slope = np.diff(joint.position[places], axis=0) / np.diff(time[places])[:, None]
-    # A position that jumps says nothing of the speed.
-    behind = np.array([jump.behind for jump in position_jumps(joint)], dtype=np.int64)
-    whole = np.diff(np.searchsorted(behind, places, side="right")) == 0
-    inner, slope = inner[whole], slope[whole]
-    if not np.isfinite(inner).all():
-        return
+    inner, slope, change = blocks
+    yield from _late(session, inner, slope, change)
     moved = np.ptp(joint.position, axis=0) > _MOVED
     factors: dict[int, float] = {}
     for k in map(int, np.flatnonzero(moved)):
@@ -658,6 +644,57 @@ def _velocity(session: Session) -> Iterator[Doubt]:
         looks = f"a {kind} of one of the two"
         mend = "check sign and unit of position and velocity of this joint"
         yield Doubt("velocity", (session.joint_names[k],), seen, looks, mend, False, name)
+
+
+def _speeds(joint: JointColumns) -> tuple[Floats, Floats, Floats] | None:
+    """Velocities, dq/dt and accelerations (m, J) by the velocities, means over blocks: the first two are exact there.
+    None without velocities."""
+    if not joint.velocity.shape[1] or len(joint) < 100:
+        return None
+    clock = joint.publish_time if np.ptp(joint.publish_time) > 0 else joint.log_time
+    time = (clock - clock[0]) * 1e-9
+    size = max(_BLOCK, int(np.ceil(_BLOCK_S / max(float(np.median(np.diff(time))), 1e-9))))
+    places = np.arange(0, len(time) - 1, size)
+    if len(places) < 20:
+        return None
+    sums = np.vstack([np.zeros(joint.velocity.shape[1]), np.cumsum(joint.velocity, axis=0)])
+    # The trapezoidal mean of the velocity over a block is the difference of its positions.
+    ends = places[1:]
+    inner = (
+        sums[ends + 1] - sums[places[:-1]] - 0.5 * (joint.velocity[ends] + joint.velocity[places[:-1]])
+    ) / size
+    slope = np.diff(joint.position[places], axis=0) / np.diff(time[places])[:, None]
+    change = np.gradient(inner, 0.5 * (time[ends] + time[places[:-1]]), axis=0)
+    # A position that jumps says nothing of the speed.
+    behind = np.array([jump.behind for jump in position_jumps(joint)], dtype=np.int64)
+    whole = np.diff(np.searchsorted(behind, places, side="right")) == 0
+    return (inner[whole], slope[whole], change[whole]) if np.isfinite(inner).all() else None
+
+
+def _late(session: Session, inner: Floats, slope: Floats, change: Floats) -> Iterator[Doubt]:
+    """Positions late against their velocities v: dq/dt = v - L dv/dt. Late velocities, such as filtered ones, harm
+    nothing: no row is made of them."""
+    least, found = max(LATE_S, 1.5 * session.joint.period_s), dict[int, tuple[float, float]]()
+    for k in map(int, np.flatnonzero(np.ptp(session.joint.position, axis=0) > _MOVED)):
+        columns, own = np.column_stack([inner[:, k], -change[:, k]]), slope[:, k]
+        (factor, product), _, rank, _ = np.linalg.lstsq(columns, own, rcond=None)
+        fit = columns @ np.array([factor, product])
+        if rank < 2 or factor <= 0.0 or _correlation(fit, own) < _CORRELATED:
+            continue
+        variance = float(np.mean((own - fit) ** 2)) * np.linalg.inv(columns.T @ columns)[1, 1]
+        late, std = float(product / factor), float(np.sqrt(variance) / factor)
+        if late > max(least, _SURE * std):
+            found[k] = late, std
+    if found:
+        k = max(found, key=lambda joint: found[joint][0])
+        names = tuple(session.joint_names[joint] for joint in found)
+        size = f"{1e3 * found[k][0]:.0f} ± {1e3 * found[k][1]:.1g} ms"
+        seen = (
+            f"comes {size} after its velocity"
+            if len(found) == 1
+            else f"come up to {size} after their velocities"
+        )
+        yield Doubt("position", names, seen, "late positions", MEND_TIME, False, session.path.name)
 
 
 def _by_unit(factor: float) -> bool:

@@ -8,6 +8,10 @@ from dataclasses import dataclass
 
 from fri.errors import DataError
 
+LATE_S = 0.01
+"""Least delay of a position of interest [s]: see `positions`."""
+MEND_TIME = "shift the column by that time before the import, or record it with the stamps of its own samples"
+
 
 @dataclass(frozen=True)
 class Doubt:
@@ -46,6 +50,11 @@ def doubted_joints(doubts: Sequence[Doubt]) -> frozenset[str]:
         if doubt.channel == "position" or "torque" in doubt.channel
         for joint in doubt.joints
     )
+
+
+def late_positions(doubts: Sequence[Doubt]) -> bool:
+    """Whether the positions of a joint are late; the torques of all joints seem early or late with them."""
+    return any(doubt.mend == MEND_TIME for doubt in doubts)
 
 
 def settle(doubts: Sequence[Doubt]) -> list[str]:

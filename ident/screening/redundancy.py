@@ -58,16 +58,17 @@ _COVERED = 0.9
 _RESTING, _HARDLY = 0.5, 0.1
 
 
-_ARRAYS = ("time", "q", "qd", "qdd", "sign", "coupled", "torque", "slope", "moving")
+_ARRAYS = ("time", "q", "qd", "qdd", "jerk", "sign", "turn", "coupled", "torque", "slope", "moving")
 
 
 @dataclass(frozen=True)
 class SampledRows:
     """Filtered motion and torque of one side of one session at the times of its rows.
 
-    time : (K,) [s]; in `Redundancy` over the session's length, from 0 to 1. q, qd, qdd, sign, torque,
-    slope : (K, n); sign is the filtered sign(qd), slope the time derivative of the torque. moving : (K, n), bool; the
-    friction of a joint at rest may be any up to its Coulomb torque. half : 0 or 1, of the session.
+    time : (K,) [s]; in `Redundancy` over the session's length, from 0 to 1. q, qd, qdd, jerk, sign, turn, torque,
+    slope : (K, n); sign is the filtered sign(qd), and jerk, turn and slope are the time derivatives of qdd, sign and
+    torque. moving : (K, n), bool; the friction of a joint at rest may be any up to its Coulomb torque. half : 0 or 1,
+    of the session.
     """
 
     side: str
@@ -77,7 +78,9 @@ class SampledRows:
     q: Floats
     qd: Floats
     qdd: Floats
+    jerk: Floats
     sign: Floats
+    turn: Floats
     coupled: Floats
     torque: Floats
     slope: Floats
@@ -91,11 +94,17 @@ class SampledRows:
 
     def moved(self, q: Floats, speed: Floats) -> SampledRows:
         """The rows with positions Q = q A + offset already in `q`, and speeds times the matrix `speed` (n, n)."""
-        return replace(self, q=q, qd=self.qd @ speed, qdd=self.qdd @ speed, sign=self.sign @ np.sign(speed))
+        rates = {name: getattr(self, name) @ speed for name in ("qd", "qdd", "jerk")}
+        rates |= {name: getattr(self, name) @ np.sign(speed) for name in ("sign", "turn")}
+        return replace(self, q=q, **rates)
 
     def at_pace(self, factor: float) -> SampledRows:
         """The rows with the time divided by `factor`."""
-        return replace(self, qd=self.qd * factor, qdd=self.qdd * factor**2, slope=self.slope * factor)
+        rates = {
+            name: getattr(self, name) * factor**order
+            for name, order in (("qd", 1), ("qdd", 2), ("jerk", 3), ("turn", 1), ("slope", 1))
+        }
+        return replace(self, **rates)
 
     def thinned(self, step: int) -> SampledRows:
         """Every `step`-th row."""
@@ -167,10 +176,12 @@ def _rows(
     q, qd, qdd, sign, coupled = (middle.apply(block_means(values, factor))[kept] for values in motion)
     resting = (np.abs(channel.qd) < signals.standstill_rad_s).astype(np.float64)
     moving = middle.apply(block_means(resting, factor))[kept] < _RESTING
-    slope = (low_pass(step).apply(torque) - low_pass(-step).apply(torque)) / (2.0 * step)
+    changing = np.hstack([torque, *(block_means(values, factor) for values in motion[2:4])])
+    rates = (low_pass(step).apply(changing) - low_pass(-step).apply(changing))[kept] / (2.0 * step)
+    slope, jerk, turn = np.split(rates, 3, axis=1)
     smooth = middle.apply(torque)[kept]
     return SampledRows(
-        channel.side, record, payload, at[kept], q, qd, qdd, sign, coupled, smooth, slope[kept], moving
+        channel.side, record, payload, at[kept], q, qd, qdd, jerk, sign, turn, coupled, smooth, slope, moving
     )
 
 

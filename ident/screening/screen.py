@@ -29,7 +29,7 @@ from ident.rows.content import Kept, Recall
 from ident.rows.filters import SignalSettings
 from ident.rows.sessions import payload_name, stated_mass
 from ident.screening.channels import check_channels, check_limits, dead
-from ident.screening.doubts import Doubt, settle
+from ident.screening.doubts import MEND_TIME, Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, contradicts, explain, unit_of
 from ident.screening.positions import position_errors
 from ident.screening.redundancy import FLOOR, Class, Fit, Normal, Part, Redundancy
@@ -65,9 +65,6 @@ _DRIVES, _MOST_BY_ONE = 5.0, 10.0
 _MEND_POSITION = (
     "check zero and gain of this channel (`offset_rad` and `scale` in the mapping of the import) and the joint's frame "
     "in the URDF"
-)
-_MEND_TIME = (
-    "shift the column by that time before the import, or record it with the stamps of its own samples"
 )
 # Latest screenings: the same recordings are estimated several times.
 _MOST_SCREENED = 64
@@ -218,7 +215,7 @@ def _positions(data: Redundancy, fit: Fit, normal: Normal, sessions: Sequence[Se
             (names[one.joint],),
             f"contradicts the torques of the other joints; {_better(one.drop)}",
             one.looks_like + _opposite(one.parts, sessions),
-            _MEND_TIME if one.kind == "delay" else _MEND_POSITION,
+            MEND_TIME if one.kind == "delay" else _MEND_POSITION,
             False,
             sessions[one.parts[0][0]].path.name if one.parts else "",
         )

@@ -31,7 +31,7 @@ from ident.dynamics.kinematics import Chain
 from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
 from ident.screening.channels import check_channels, check_limits
-from ident.screening.doubts import Doubt, explaining, settle
+from ident.screening.doubts import Doubt, explaining, late_positions, settle
 from ident.screening.explanations import unit_of
 from ident.screening.positions import position_errors
 from ident.screening.screen import _in_bands, require_sound, screen, without_dead
@@ -394,6 +394,14 @@ def test_positions_that_are_a_copy_of_another_joints_are_told(pair: list[Session
     assert not [d for d in check_channels([same], chain()) if "column" in d.looks_like]
 
 
+def late(session: Session, place: int, size: float) -> Session:
+    """Positions of a joint (from 0) late by `size` [s]."""
+    position = session.joint.position.copy()
+    time = np.arange(len(position)) * session.joint.period_s
+    position[:, place] = np.interp(time - size, time, position[:, place])
+    return replace(session, joint=replace(session.joint, position=position))
+
+
 @pytest.mark.parametrize(
     ("name", "kind", "size"),
     [
@@ -411,13 +419,11 @@ def test_a_position_with_a_small_error_is_told_with_its_size(
     place = chain().joint_names.index(name)
 
     def edited(session: Session) -> Session:
+        if kind == "delay":
+            return late(session, place, size)
         position = session.joint.position.copy()
         own = position[:, place]
-        if kind == "delay":
-            time = np.arange(len(own)) * session.joint.period_s
-            position[:, place] = np.interp(time - size, time, own)
-        else:
-            position[:, place] = own + size if kind == "offset" else (1.0 + size) * own
+        position[:, place] = own + size if kind == "offset" else (1.0 + size) * own
         return replace(session, joint=replace(session.joint, position=position))
 
     data = next(_in_bands([edited(session) for session in pair], chain(), SignalSettings(), (), Recall()))
@@ -425,6 +431,25 @@ def test_a_position_with_a_small_error_is_told_with_its_size(
     (found,) = position_errors(data, data.fit(normal), normal)
     assert (chain().joint_names[found.joint], found.kind) == (name, kind)
     assert found.size == pytest.approx(size, abs=max(0.2 * abs(size), 3.0 * found.std))
+
+
+def test_late_positions_show_in_motor_torques_alone(pair: list[Session]) -> None:
+    sessions = without("joint", lambda sessions: [late(one, 3, 0.02) for one in sessions])(pair)
+    (found,) = screen(sessions, chain())
+    assert (found.channel, found.joints) == ("position", ("A3",))
+    assert "looks like positions 20 ± " in str(found)
+    assert late_positions([found])
+
+
+def test_positions_that_come_after_their_velocities_are_told(pair: list[Session]) -> None:
+    whole = with_speed()(pair[:1])
+    (found,) = check_channels([late(whole[0], 3, 0.02)], chain())
+    assert (found.channel, found.joints) == ("position", ("A3",))
+    assert re.match(r"comes 2[01] ± [\d.]+ ms after its velocity", found.seen)
+    # A velocity late by its filter has no part in the rows.
+    joint = whole[0].joint
+    filtered = replace(joint, velocity=np.roll(joint.velocity, 8, axis=0))
+    assert check_channels([replace(whole[0], joint=filtered)], chain()) == []
 
 
 def test_positions_of_a_healthy_arm_have_no_small_error(pair: list[Session]) -> None:
