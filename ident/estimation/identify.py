@@ -36,7 +36,7 @@ from ident.rows.prepared import PreparedSession
 from ident.rows.sessions import payload_name, require
 from ident.rows.shared_rows import marks
 from ident.rows.signal_choice import choose_signals
-from ident.screening.doubts import Doubt, doubted_joints, explaining, settle
+from ident.screening.doubts import Doubt, doubted_joints, explaining, late_positions, settle
 from ident.screening.screen import require_sound
 from lwr_driver.listing import Piece, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
@@ -357,6 +357,7 @@ class Observed:
         ]
         warnings += require_plausible(problem, estimate, self.structure.chain.joint_names)
         warnings += payload_warnings(self.sessions, self.payloads, base, estimate, self.structure)
+        warnings += [] if self.full_rank else _too_short(estimate, self.prepared)
         warnings += _excitation_warnings(problem, estimate, self.full_rank, doubted)
         return Identification(
             settings=settings,
@@ -473,7 +474,8 @@ def observed(
         # One session after the other, so that memory holds the full-rate signals of one only.
         pairs = list(zip(chosen, mounted, strict=True))
         made = [make(session, payload, signals=settings.signals) for session, payload in pairs]
-        made = apart_in_time(with_delays(made, pairs, settings.signals, make))
+        late = late_positions(known.doubts)
+        made = apart_in_time(with_delays(made, pairs, settings.signals, make, late_positions=late))
         for warning in (text for one in made for text in one.prepared.warnings) if first else ():
             # The result holds them; here they precede an error.
             logger.info("%s", warning)
@@ -555,6 +557,21 @@ def _late_joints(prepared: Sequence[PreparedSession]) -> frozenset[str]:
     """Joints with a torque that is late by itself."""
     delays = [delay for session in prepared for delay in (session.joint_delay, session.delay)]
     return frozenset(joint for delay in delays if delay is not None for joint in delay.apart)
+
+
+def _too_short(estimate: Estimate, prepared: Sequence[PreparedSession]) -> list[str]:
+    """A warning where most parameters are less certain than their size, of motion without full rank: with it real arms
+    have up to a half of such parameters, small ones."""
+    sizes = np.abs(estimate.values)
+    unsure = int(np.count_nonzero(estimate.std > sizes))
+    if 2 * unsure <= len(sizes):
+        return []
+    seconds = sum(session.counts["rows"] * session.row_time_s for session in prepared)
+    return [
+        f"too little motion: {unsure} of {len(sizes)} parameters have a standard deviation beyond their size, from "
+        f"{seconds:.2g} s of motion; the model holds for this motion at best: record half a minute or more, with every "
+        "joint over much of its range"
+    ]
 
 
 def _excitation_warnings(

@@ -86,6 +86,16 @@ class SessionRows:
                 f"{1e3 * late:.1f} ± {1e3 * std:.1g} ms late, against {1e3 * delay.estimate:.1f} ms of the other "
                 "joints; check how this channel is recorded"
             )
+        if delay.torn is not None and not said:
+            ends = [
+                f"{1e3 * late:.1f} ± {1e3 * std:.1g}"
+                for late, std in map(delay.by_joint.__getitem__, delay.torn)
+            ]
+            said.append(
+                f"{self.prepared.name}: the joints disagree on the delay of the {self.side} torques, {ends[0]} ms in "
+                f"{delay.torn[0]} and {ends[1]} ms in {delay.torn[1]}; check how positions and torques of these joints "
+                "are recorded"
+            )
         return replace(self, prepared=replace(self.prepared, warnings=(*self.prepared.warnings, *said)))
 
 
@@ -128,10 +138,13 @@ def with_delays(
     of: Sequence[tuple[Session, str | None]],
     signals: SignalSettings,
     make: Callable[..., SessionRows],
+    *,
+    late_positions: bool = False,
 ) -> list[SessionRows]:
     """The rows with the delays that the base model tells: of joint torques, or of motor torques alone.
 
-    of : session and payload of each. signals : of the estimate. make : `session_rows` with the rest of its arguments.
+    late_positions : of a joint, known already; delays that follow are no news. of : session and payload of each.
+        signals : of the estimate. make : `session_rows` with the rest of its arguments.
     """
     setting = {"joint": "joint_delay_s", "motor": "motor_delay_s"}
 
@@ -149,7 +162,7 @@ def with_delays(
         some = untold[first : first + _TOGETHER]
         told = _told([made[k] for k in some], [partial(at, k) for k in some])
         for k, rows in zip(some, told, strict=True):
-            found[k] = rows.doubted()
+            found[k] = rows if late_positions else rows.doubted()
             logger.info("%s: %s torques %s", rows.prepared.name, rows.side, rows.delay)
     return found
 

@@ -71,6 +71,9 @@ _ALIKE = 3.0
 # is late by itself.
 _AGREES = 3.0
 _APART, _APART_S = 20.0, 5e-3
+# Distance of the earliest from the latest joint that is told [s], in standard deviations, and the largest of these [s]:
+# on a real LWR4+ delays that differ by 130 ms are known to 4 ms at best.
+_TORN_S, _TORN, _CLEAR_S = 8e-3, 5.0, 2e-3
 # A delay within this many standard deviations of zero is not told apart from zero.
 _DISTINCT = 1.96
 # Delays of two sessions that differ, in standard deviations, and at least [s].
@@ -126,6 +129,15 @@ class Delay:
     def early(self) -> bool:
         """Whether the estimate is before the earliest, beyond its interval and beyond the elasticity of joints."""
         return self.estimate < self.earliest - 3.0 * self.std - _ELASTIC_S
+
+    @property
+    def torn(self) -> tuple[str, str] | None:
+        """The joints with the least and the greatest delay of those that are clear, where these contradict."""
+        clear = sorted((late, std, name) for name, (late, std) in self.by_joint.items() if std < _CLEAR_S)
+        if len(clear) < 2:
+            return None
+        (early, one, first), (late, other, last) = clear[0], clear[-1]
+        return (first, last) if late - early > max(_TORN_S, _TORN * float(np.hypot(one, other))) else None
 
     def __str__(self) -> str:
         late = -1.0 if self.seconds < 0.0 else 1.0

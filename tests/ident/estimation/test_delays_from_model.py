@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identify import Identification, IdentificationSettings, Known, identify
 from ident.estimation.validate import validate
 from ident.estimators.problem import Problem
 from ident.rows.delay import Delay, delays_from_model, shared_delay
+from ident.screening.doubts import MEND_TIME, Doubt
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session, true_base
 
@@ -136,27 +137,35 @@ def test_delays_of_many_long_sessions_come_from_a_few_and_their_first_rows(
         assert one.joint_delay.seconds == pytest.approx(late_s, abs=max(4.0 * one.joint_delay.std, 2e-4))
 
 
-def _late_by_joint(own: dict[str, float]) -> Delay:
+def _late_by_joint(own: dict[str, float]) -> tuple[Delay, tuple[str, ...]]:
+    """Delay of joint torques late by joint, and the warnings."""
     found = identify([sensed(0.0, 1)], chain(), SETTINGS)
     groups = []
     for place, group in enumerate(found.problem.groups):
         slope = next(one.columns[place] for one in found.problem.nuisances if place in one.columns)
         late = own[group.joint] if group.side == "joint" else 0.0
         groups.append(replace(group, target=group.target - late * slope))
-    return delays_from_model(replace(found.problem, groups=tuple(groups)), {0: "joint"}, {0: 0.0})[0]
+    delay = delays_from_model(replace(found.problem, groups=tuple(groups)), {0: "joint"}, {0: 0.0})[0]
+    prepared = replace(found.prepared[0], joint_delay=delay)
+    return delay, session_rows.SessionRows(prepared, found.problem, None).doubted().prepared.warnings
 
 
 def test_joints_that_disagree_tell_no_delay() -> None:
     names = chain().joint_names
-    delay = _late_by_joint(dict(zip(names, np.linspace(-0.012, 0.012, 7).tolist(), strict=True)))
+    delay, (told,) = _late_by_joint(dict(zip(names, np.linspace(-0.012, 0.012, 7).tolist(), strict=True)))
     assert delay.disagreement > 3.0
     assert (delay.seconds, delay.std) == (0.0, 0.0)
     assert str(delay) == "not late (the joints disagree)"
+    assert re.search(
+        r"disagree on the delay of the joint torques, -12.0 ± \S+ ms in A1 and 1[12]\S+ ± \S+ ms in A6", told
+    )
+    unsure = {name: (late, 5e-3) for name, (late, _) in delay.by_joint.items()}
+    assert replace(delay, by_joint=unsure).torn is None
 
 
 def test_a_joint_late_by_itself_is_named_beside_the_delay_of_the_others() -> None:
     own = dict.fromkeys(chain().joint_names, -0.004)
-    delay = _late_by_joint({**own, "A1": 0.004})
+    delay, _ = _late_by_joint({**own, "A1": 0.004})
     assert delay.apart == ("A1",)
     assert delay.by_joint["A1"][0] == pytest.approx(0.004, abs=3e-4)
     assert delay.seconds == pytest.approx(-0.004, abs=1e-4)
@@ -173,6 +182,9 @@ def test_a_joint_late_by_itself_is_a_warning_of_the_result(caplog: pytest.LogCap
     late = re.search(r"E1 joint torque fits the motion best ([\d.]+) ± [\d.]+ ms late", told)
     assert late is not None
     assert float(late[1]) == pytest.approx(20.0, abs=0.5)
+    known = Known((Doubt("position", ("E1",), "comes late", "late positions", MEND_TIME),))
+    again = identify(replace(log, joint=replace(log.joint, effort=effort)), chain(), SETTINGS, known=known)
+    assert not [text for text in again.warnings if "of the other joints; check how this" in text]
 
 
 def test_torques_of_an_arm_at_rest_have_no_delay_to_tell() -> None:

@@ -209,6 +209,17 @@ def test_a_joint_that_never_moves_is_named():
         identify(still, arm.chain(), IdentificationSettings(model=1))
 
 
+def test_less_than_a_second_of_motion_is_too_little_and_it_is_said():
+    whole = sessions(command=True)[0]
+    start = int(whole.joint.log_time[0]) + 3 * 10**9
+    joint = whole.joint.rows(start, start + 750_000_000)
+    short = dataclasses.replace(whole, joint=joint, motor=None, command=None)
+    settings = IdentificationSettings(model=1, estimator="physical", essential=None)
+    found = identify(short, arm.chain(), settings)
+    assert [text for text in found.warnings if text.startswith("too little motion: ")]
+    assert not [text for text in model_2().warnings if "too little motion" in text]
+
+
 def named(session, payload, mass=""):
     return dataclasses.replace(
         session, metadata={**session.metadata, "payload": payload, "payload_mass": mass}
