@@ -86,7 +86,7 @@ def position_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[Position
     ]
     found = _errors(data, fit, normal, [*asked, *_by_session(data, normal)])
     best = max(found, key=lambda one: one.drop, default=None)
-    return [] if best is None or best.drop <= _leaning(data, fit, normal) else [best]
+    return [] if best is None or best.drop <= leaning(data, fit, normal) else [best]
 
 
 def session_offsets(data: Redundancy, fit: Fit, normal: Normal) -> list[PositionError]:
@@ -137,7 +137,7 @@ def _changed(data: Redundancy, joint: int, kind: str, size: float, parts: tuple[
     return replace(data, rows=tuple(rows))
 
 
-def _leaning(data: Redundancy, fit: Fit, normal: Normal) -> float:
+def leaning(data: Redundancy, fit: Fit, normal: Normal) -> float:
     """Fall of the score with the base leaning as it explains most."""
     gravity = np.asarray(data.chain.gravity, dtype=np.float64)
     size = float(np.linalg.norm(gravity))
@@ -148,9 +148,9 @@ def _leaning(data: Redundancy, fit: Fit, normal: Normal) -> float:
     turned = [replace(data, chain=replace(data.chain, gravity=one)) for one in sideways]
     columns = ([one.rigid(rows, fit) for rows in still] for one in turned)
     tilt = [found.value for found in data.along(fit, normal, columns)]
-    leaning = gravity + tilt @ sideways
-    leaning *= size / np.linalg.norm(leaning)
-    return fit.score - replace(data, chain=replace(data.chain, gravity=leaning)).fit(doubtful=False).score
+    down = gravity + tilt @ sideways
+    down *= size / np.linalg.norm(down)
+    return fit.score - replace(data, chain=replace(data.chain, gravity=down)).fit(doubtful=False).score
 
 
 def changed(rows: SampledRows, joint: int, kind: str, size: float) -> SampledRows:

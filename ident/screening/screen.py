@@ -31,8 +31,9 @@ from ident.rows.sessions import payload_name, stated_mass
 from ident.screening.channels import check_channels, check_limits, dead
 from ident.screening.doubts import MEND_TIME, Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, contradicts, explain, unit_of
-from ident.screening.positions import position_errors
+from ident.screening.positions import KINDS, leaning, position_errors
 from ident.screening.redundancy import FLOOR, Class, Fit, Normal, Part, Redundancy
+from ident.screening.zeros import zero_by_gravity
 from lwr_driver.session import Session, Sessions, as_sessions
 
 logger = logging.getLogger(__name__)
@@ -203,7 +204,10 @@ def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> tuple[list
         normal = data.normal()
         fit = data.fit(normal)
     found += _physics(data, fit, normal)
-    return found or _positions(data, fit, normal, sessions) or _of_motors(data), fit.score, agree
+    found = (
+        found or _positions(data, fit, normal, sessions) or [*_zeros(data, fit, normal), *_of_motors(data)]
+    )
+    return found, fit.score, agree
 
 
 def _positions(data: Redundancy, fit: Fit, normal: Normal, sessions: Sequence[Session]) -> list[Doubt]:
@@ -221,6 +225,25 @@ def _positions(data: Redundancy, fit: Fit, normal: Normal, sessions: Sequence[Se
         )
         for one in position_errors(data, fit, normal)
     ]
+
+
+def _zeros(data: Redundancy, fit: Fit, normal: Normal) -> list[Doubt]:
+    """A zero that the URDF's gravity tells alone; a base that leans looks like one."""
+    try:
+        nominal = data.chain.urdf_inertials()
+    except LwrError:
+        return []
+    if data.chain.placeholder_masses():
+        return []
+    found = zero_by_gravity(data.chain, _poses(data), _bodies(data, fit), nominal)
+    if found is None or leaning(data, fit, normal) > KINDS["offset"].drop:
+        return []
+    seen = (
+        f"gravity differs from that of the URDF's bodies by {100.0 * found.before:.2g} %, by "
+        f"{100.0 * found.after:.2g} % with it undone"
+    )
+    looks = f"a zero offset of {np.degrees(found.size):.0f} deg, or a centre of mass elsewhere"
+    return [Doubt("position", (data.chain.joint_names[found.joint],), seen, looks, _MEND_POSITION)]
 
 
 def _better(drop: float) -> str:
