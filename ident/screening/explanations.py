@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.dynamics.parameters import Floats
+from ident.screening.nominal import nominal
 from ident.screening.parts import DEVIATIONS, GAIN, LEFT, PartError, part_errors, scopes
 from ident.screening.positions import session_offsets
 from ident.screening.redundancy import Class, Fit, Gain, Normal, Part, Redundancy
@@ -39,6 +40,10 @@ _POSITION_GAINS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 _PACES = (0.25, 0.5, 2.0 / 3.0, 0.8, 1.25, 1.5, 2.0, 4.0)
 # Fall of the score for which a plain factor is given up.
 _FINER = 0.1
+# Most corrections of a gain.
+_ROUNDS = 8
+# Relative standard deviation of bodies from those of the URDF, and logarithm of the odds that exclude a gain.
+_STATED, _ODDS = 0.2, float(np.log(10.0))
 _OFFSETS = (-np.pi, -0.5 * np.pi, 0.5 * np.pi)
 # Candidates that are fitted to the end, rounds in which all are compared, and for motions the rows for each parameter.
 _LIKELY, _SOON, _ENOUGH = 8, 3, 6.0
@@ -50,7 +55,7 @@ class Explanation:
 
     channel : as in `Doubt`. factor : recorded over true value, for a change of scale. gain : of a torque. parts,
     error : the parts of the data with it, and its size there. label : number of the session with another payload.
-    alike : the same of other sessions, which explain the data as well.
+    alike : the same of other sessions, or gains of other joints, which explain the data as well.
     """
 
     channel: str
@@ -118,7 +123,8 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
         after = candidate.mended.fit(normal if mapped else None, doubtful=False)
         return replace(candidate, drop=before - after.score), after
 
-    for candidate in _likely(_torques(data, data.gains(fit, normal)), normal):
+    gains = data.gains(fit, normal)
+    for candidate in _likely(_torques(data, gains), normal):
         one, after = scored(candidate)
         tried.append(one)
         if believed(one, len(normal.classes)) and max(after.rho.values()) < AGREES:
@@ -134,7 +140,35 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
         # Of two sessions with one label the one carries more, or the other less.
         others = {one.label: one for one in reversed(tried) if one.channel == "payload" and _alike(one, best)}
         return replace(best, alike=tuple(one for label, one in sorted(others.items()) if label != best.label))
-    return None if best is None else _refined(best, before, normal)
+    if best is None or best.gain is None or len(best.joints) > 1:
+        return None if best is None else _refined(best, before, normal)
+    return _likeliest(_refined(best, before, normal), _rivals(data, best, gains), before, normal)
+
+
+def _rivals(data: Redundancy, best: Explanation, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:
+    """Gains of the other joints on the side, whatever they leave of the joint's own residual; none of a sign."""
+    for (side, joint), gain in gains.items() if best.factor > 0.0 else ():
+        other = best.channel == f"{side} torque" and joint not in best.joints
+        if other and _is_off(gain) and gain.value > 0.0:
+            yield _gain_of(data, side, joint, gain)
+
+
+def _likeliest(
+    best: Explanation, rivals: Iterable[Explanation], before: float, normal: Normal
+) -> Explanation:
+    """The gain that leaves bodies nearest to the URDF's, and the others that they do not exclude.
+
+    Torques of one joint too large and those of all that share its bodies too small fit alike.
+    """
+    others = [_measured_again(one, before, normal) for one in rivals]
+    alike = [best, *(one for one in others if one.drop > best.drop - _FINER)]
+    if len(alike) == 1:
+        return best
+    data = best.mended
+    stated = replace(normal, prior=nominal(data.chain, data.width, _STATED))
+    odds = [-normal.rows * one.mended.fit(stated, doubtful=False).cost for one in alike]
+    first, *rest = sorted(zip(odds, range(len(alike)), strict=True), reverse=True)
+    return replace(alike[first[1]], alike=tuple(alike[k] for odd, k in rest if first[0] - odd < _ODDS))
 
 
 def _alike(one: Explanation, best: Explanation) -> bool:
@@ -244,14 +278,7 @@ def _torque_gains(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Exp
     for side in data.sides:
         own = {joint: gain for (where, joint), gain in gains.items() if where == side}
         wrong = {joint: gain for joint, gain in own.items() if is_wrong(gain)}
-        for joint, gain in wrong.items():
-            scale = np.eye(data.chain.n)
-            scale[joint, joint] = 1.0 / gain.value
-            small = abs(gain.value) < 3.0 * gain.std
-            looks = "a torque in a unit far too large, or none" if small else unit_of(gain.value, torque=True)
-            yield Explanation(
-                f"{side} torque", (joint,), looks, data.mapped(side, scale), 0.0, gain.value, gain
-            )
+        yield from (_gain_of(data, side, joint, gain) for joint, gain in wrong.items())
         middle = float(np.median([gain.value for gain in wrong.values()])) if wrong else 1.0
         alike = [joint for joint, gain in wrong.items() if abs(gain.value / middle - 1.0) < 0.3]
         if len(alike) > max(1, len(own) // 2):
@@ -262,10 +289,21 @@ def _torque_gains(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Exp
             )  # fmt: skip
 
 
+def _gain_of(data: Redundancy, side: str, joint: int, gain: Gain) -> Explanation:
+    scale = np.eye(data.chain.n)
+    scale[joint, joint] = 1.0 / gain.value
+    small = abs(gain.value) < 3.0 * gain.std
+    looks = "a torque in a unit far too large, or none" if small else unit_of(gain.value, torque=True)
+    return Explanation(f"{side} torque", (joint,), looks, data.mapped(side, scale), 0.0, gain.value, gain)
+
+
 def is_wrong(gain: Gain) -> bool:
     """Whether a gain is off by more than a calibration and its deviation, and mending it helps."""
-    off = abs(gain.value - 1.0)
-    return off > max(GAIN, DEVIATIONS * gain.std) and gain.left < LEFT and gain.value != 0.0
+    return _is_off(gain) and gain.left < LEFT
+
+
+def _is_off(gain: Gain) -> bool:
+    return abs(gain.value - 1.0) > max(GAIN, DEVIATIONS * gain.std) and gain.value != 0.0
 
 
 def _pairs(data: Redundancy) -> list[tuple[int, int]]:
@@ -349,7 +387,17 @@ def _labels(data: Redundancy) -> Iterator[Explanation]:
 
 
 def _measured_again(candidate: Explanation, before: float, normal: Normal) -> Explanation:
-    """The gain of a torque from the mended data: the wrong channel had bent the bodies that it was measured against."""
+    """The gain of a torque from the mended data, while it helps: the wrong channel had bent the bodies that it was
+    measured against."""
+    for _ in range(_ROUNDS):
+        better = _corrected(candidate, before, normal)
+        if better.drop <= candidate.drop:
+            break
+        candidate = better
+    return candidate
+
+
+def _corrected(candidate: Explanation, before: float, normal: Normal) -> Explanation:
     (joint,), data = candidate.joints, candidate.mended
     side = candidate.channel.removesuffix(" torque")
     fit = data.fit(normal, doubtful=False)
@@ -359,8 +407,6 @@ def _measured_again(candidate: Explanation, before: float, normal: Normal) -> Ex
     scale[joint, joint] = 1.0 / more if more > 0.0 else 1.0
     mended = data.mapped(side, scale)
     drop = before - mended.fit(normal, doubtful=False).score
-    if drop <= candidate.drop:
-        return candidate
     factor = candidate.factor * more
     gain = replace(candidate.gain, value=factor, std=candidate.gain.std * more)
     named = candidate.looks_like == unit_of(candidate.factor, torque=True)

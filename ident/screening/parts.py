@@ -98,7 +98,7 @@ def _suspects(
             shared[where] += added @ own
             power[where] += np.sum(added**2, axis=1)
             product[where] += added @ error
-    total = normal.total(fit.weight)
+    total = normal.total(fit)
     chosen = [
         np.array([data.map_of(side, part)[joint] for part in normal.parts]) for side, joint in normal.classes
     ]

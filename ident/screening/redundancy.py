@@ -10,7 +10,9 @@ with the torques of all joints of the side, a one and the time in Y. A changed t
 interchanged joints) is then a linear map of Y and needs no new rows. B_c and T_c are kept by part, half a session each,
 because a channel may be wrong in one session or from some moment on. The fit reweights each class by its own residual,
 so that a wrong channel does not bend the others: it stands out by its residual. The statistic of a class is rho, its
-residual over its torque; the sum of log rho over the classes ranks explanations.
+residual over its torque; the sum of log rho over the classes ranks explanations. Where the URDF states bodies, their
+distance from it is weighted like a class, in the order of magnitude alone: without it bodies of a hundred times the
+weight, some of them negative, take up the gain of a torque.
 """
 
 from __future__ import annotations
@@ -29,11 +31,13 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, LINK_FRICTION, Floats
 from ident.dynamics.regressor import rigid_regressor, torque
 from ident.dynamics.structure import Coupling
+from ident.estimators.prior import Prior
 from ident.rows.content import Recall
 from ident.rows.filters import ParallelFilter, SignalSettings, block_means, thinning
 from ident.rows.prepare import prepare
 from ident.rows.prepared import TorqueChannel
 from ident.rows.sessions import payload_name
+from ident.screening.nominal import nominal
 from lwr_driver.session import Session
 
 Class = tuple[str, int]
@@ -50,6 +54,8 @@ _ROUNDS, _SETTLED = 8, 1e-3
 _DEPENDENT = 1e-9
 # Norm of a column over the largest, below which it is nothing but rounding.
 _NOTHING = 1e-10
+# Relative standard deviation of bodies that are the URDF's in the order of magnitude.
+_ORDER = 2.0
 # Rows with a common error: two seconds at the usual rate.
 _BLOCK = 10
 _MOST_ROWS = 800
@@ -190,7 +196,7 @@ class Normal:
     """Normal equations of the m classes, the torques' of the o parts.
 
     matrix : G (m, p, p). mixed : B^T (m, o, n + 2, p). scatter, square : T (m, o, n + 2, n + 2) without the mean of the
-    session, and S with it.
+    session, and S with it. prior : of the bodies, by the URDF's.
     """
 
     classes: tuple[Class, ...]
@@ -199,19 +205,31 @@ class Normal:
     mixed: Floats
     scatter: Floats
     square: Floats
+    prior: Prior
 
-    def total(self, weight: Mapping[Class, float]) -> Floats:
-        """Weighted sum of the matrices, (p, p)."""
-        return np.tensordot([weight[key] for key in self.classes], self.matrix, 1)
+    def total(self, fit: Fit) -> Floats:
+        """Weighted sum of the matrices and the prior's precision, (p, p)."""
+        weights = [fit.weight[key] for key in self.classes]
+        return np.tensordot(weights, self.matrix, 1) + fit.nominal * self.prior.precision
+
+    @property
+    def rows(self) -> float:
+        """Independent rows of a class, in the mean."""
+        return max(float(self.square[:, :, -2, -2].sum()) / (len(self.classes) * _BLOCK), 1.0)
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Parameters (p,), rho and weight of each class. `score`: sum of log rho, none below the floor."""
+    """Parameters (p,), rho and weight of each class, and weight `nominal` of the prior.
+
+    cost : what the fit minimises. `score`: sum of log rho, none below the floor.
+    """
 
     parameters: Floats
     rho: Mapping[Class, float]
     weight: Mapping[Class, float]
+    nominal: float
+    cost: float
 
     @property
     def score(self) -> float:
@@ -368,7 +386,8 @@ class Redundancy:
                 mixed[at, o] += _transposed(some) @ own
                 scatter[at, o] += _transposed(centred) @ centred
                 square[at, o] += _transposed(some) @ some
-        return Normal(tuple(place), parts, matrix, mixed, scatter, square)
+        prior = nominal(self.chain, width, _ORDER)
+        return Normal(tuple(place), parts, matrix, mixed, scatter, square, prior)
 
     def _means(self) -> dict[tuple[str, int], Floats]:
         """Means (n, n + 2) of torques, one and time of a side of a session, over the moving rows of each joint."""
@@ -418,7 +437,10 @@ class Redundancy:
         return np.asarray(_extended(rows) @ self.map_of(rows.side, rows.part)[: self.chain.n].T)
 
     def fit(self, normal: Normal | None = None, *, doubtful: bool = True, rounds: int = _ROUNDS) -> Fit:
-        """Weighted least squares, each class weighted by its own residual.
+        """Weighted least squares, each class and the prior weighted by its own residual.
+
+        The cost is the sum of log rho, and log(1 + d / N) / 2 for the squared distance d from the prior and N
+        independent rows: d counts as it should while it is small, and hardly where the URDF is of another arm.
 
         normal : of rows with different `maps` only. doubtful : whether a torque may be in a wrong unit. rounds : of
         reweighting, at most.
@@ -431,31 +453,11 @@ class Redundancy:
         )
         total = np.maximum(scatter, 1e-12 * np.maximum(square, 1e-12))
         common = np.full_like(total, np.max(total, initial=0.0) or 1.0)
-        least = FLOOR**2 * total
-        count, width, _ = normal.matrix.shape
-        flat = normal.matrix.reshape(count * width, width)
-        fits = []
-        # A torque in a wrong unit is far too heavy or far too light in one of these starts.
-        for start in (total, common)[: 1 + doubtful]:
-            weight, error, values, score = 1.0 / start, total, np.zeros(0), np.inf
-            for _ in range(rounds):
-                values = solve((weight @ flat.reshape(count, -1)).reshape(width, width), weight @ mixed)
-                fitted = (flat @ values).reshape(count, width) @ values
-                error = np.maximum(square - 2.0 * mixed @ values + fitted, 0.0)
-                weight = 1.0 / np.maximum(error, least)
-                # The score falls from round to round.
-                before, score = score, float(0.5 * np.sum(np.log(np.maximum(error, least) / total)))
-                if before - score < _SETTLED:
-                    break
-            rho = np.sqrt(error / total)
-            fits.append(
-                Fit(
-                    values,
-                    dict(zip(normal.classes, rho.tolist(), strict=True)),
-                    dict(zip(normal.classes, weight.tolist(), strict=True)),
-                )
-            )
-        return min(fits, key=lambda fit: fit.score)
+        # A torque in a wrong unit is far too heavy or far too light in one of these starts, or the URDF is.
+        starts = (total, 1.0 / normal.rows), (common, 1.0 / normal.rows), (total, 0.0)
+        sums = _Sums(mixed, square, total)
+        fits = [_reweighted(normal, sums, *start, rounds) for start in starts[: 3 if doubtful else 1]]
+        return min(fits, key=lambda fit: fit.cost)
 
     def _maps(self, normal: Normal) -> Floats:
         """Rows (m, o, n + 2) of the maps: true torque of each class in each part."""
@@ -493,9 +495,9 @@ class Redundancy:
         """Size of each error beside all parameters, with its standard deviation by blocks of rows.
 
         errors : of each the columns (n, K) for all sets of rows, what an error by one adds to the computed torques
-            [Nm]. Their projection on the parameters is taken off.
+            [Nm]. Their projection on the parameters is taken off. The prior's deviations are in that of the size.
         """
-        total = normal.total(fit.weight)
+        total = normal.total(fit)
         table = []
         for rows in self.rows:
             matrix = self.matrix(rows)
@@ -513,8 +515,12 @@ class Redundancy:
                 (column, column - matrix @ others, weight, left)
                 for (matrix, weight, left), column in zip(table, columns, strict=True)
             ]
-            den = max(sum(float(np.sum(weight * rest**2)) for _, rest, weight, _ in parts), 1e-300)
-            size = sum(float(np.sum(weight * rest * left)) for _, rest, weight, left in parts) / den
+            # The prior is a row for each of its directions: the error adds `others` to its bodies.
+            known = normal.prior.precision @ others * fit.nominal
+            den = sum(float(np.sum(weight * rest**2)) for _, rest, weight, _ in parts)
+            den = max(den + float(known @ others), 1e-300)
+            along = sum(float(np.sum(weight * rest * left)) for _, rest, weight, left in parts)
+            size = (along + float(known @ (fit.parameters - normal.prior.mean))) / den
             before = after = 0.0
             # Errors of the joints at a time may agree or cancel: by chance, not by law.
             together = apart = 0.0
@@ -528,7 +534,8 @@ class Redundancy:
                 before += float(np.sum(acting * left**2))
                 after += float(np.sum(acting * error**2))
             left_over = float(np.sqrt(after / before)) if before > 0.0 else 1.0
-            yield Size(size, float(np.sqrt(max(together, apart))) / den, left_over)
+            variance = max(together, apart) + float(known @ others) / normal.rows
+            yield Size(size, float(np.sqrt(variance)) / den, left_over)
 
     def weights(self, rows: SampledRows, fit: Fit) -> Floats:
         """Weights (n, K) of the rows of all joints, none of a joint at rest."""
@@ -545,10 +552,11 @@ class Redundancy:
         return np.asarray(torque(self.chain, rows.q, rows.qd, rows.qdd, bodies).T)
 
     def deviation(self, fit: Fit, normal: Normal, directions: Floats) -> Floats:
-        """Standard deviation (m,) of the combinations `directions` (m, p) of the parameters, by blocks of rows."""
-        total = normal.total(fit.weight)
+        """Standard deviation (m,) of the combinations `directions` (m, p) of the parameters, by blocks of rows
+        and the prior's."""
+        total = normal.total(fit)
         spreads = np.column_stack([solve(total, direction) for direction in directions])
-        variance = np.zeros(len(directions))
+        variance = fit.nominal / normal.rows * np.sum(spreads * (normal.prior.precision @ spreads), axis=0)
         for rows in self.rows:
             measured = self.true_torque(rows).T
             for own, true, weight in zip(self.matrix(rows), measured, self.weights(rows, fit), strict=True):
@@ -558,6 +566,46 @@ class Redundancy:
                     blocks = np.add.reduceat(product, np.arange(0, len(product), _BLOCK), axis=0)
                     variance += np.sum(blocks**2, axis=0)
         return np.sqrt(variance)
+
+
+class _Sums(NamedTuple):
+    """W^T y (m, p) of the classes, y^T y (m,), and the same (m,) about the mean."""
+
+    mixed: Floats
+    square: Floats
+    total: Floats
+
+
+def _reweighted(normal: Normal, sums: _Sums, start: Floats, nominal_weight: float, rounds: int) -> Fit:
+    """The fit by reweighting. start : squared residuals (m,) of the first weights. nominal_weight : first one."""
+    mixed, square, total = sums
+    least = FLOOR**2 * total
+    count, width, _ = normal.matrix.shape
+    flat, prior = normal.matrix.reshape(count * width, width), normal.prior
+    pull = prior.precision @ prior.mean
+    weight, firm, error, values, cost = 1.0 / start, nominal_weight, total, np.zeros(0), np.inf
+    for _ in range(rounds):
+        left = (weight @ flat.reshape(count, -1)).reshape(width, width) + firm * prior.precision
+        values = solve(left, weight @ mixed + firm * pull)
+        fitted = (flat @ values).reshape(count, width) @ values
+        error = np.maximum(square - 2.0 * mixed @ values + fitted, 0.0)
+        weight = 1.0 / np.maximum(error, least)
+        apart = values - prior.mean
+        distance = float(apart @ prior.precision @ apart)
+        firm = 1.0 / (normal.rows + distance)
+        # The cost falls from round to round.
+        before, residuals = cost, float(np.sum(np.log(np.maximum(error, least) / total)))
+        cost = 0.5 * (residuals + float(np.log1p(distance / normal.rows)))
+        if before - cost < _SETTLED:
+            break
+    rho = np.sqrt(error / total)
+    return Fit(
+        values,
+        dict(zip(normal.classes, rho.tolist(), strict=True)),
+        dict(zip(normal.classes, weight.tolist(), strict=True)),
+        firm,
+        cost,
+    )
 
 
 def _halves(rows: Sequence[SampledRows]) -> Iterator[SampledRows]:

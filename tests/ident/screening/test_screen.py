@@ -28,6 +28,7 @@ from benchmarks.wrong_channels import (
 )
 from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.regressor import torque
 from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
 from ident.screening.channels import check_channels, check_limits
@@ -239,31 +240,41 @@ def test_motor_torques_that_pass_for_joint_torques_show_by_the_inertia_of_the_dr
     assert doubts(without("motor", lambda sessions: sessions)(pair)) == ()
 
 
+def test_a_gain_of_a_light_wrist_is_no_matter_of_bodies_without_measure(pair: list[Session]) -> None:
+    """Bodies of a hundred times the URDF's weight would explain it as well."""
+    (gain,) = doubts(without("motor", scaled("joint", "effort", 1.3, "A5"))(pair[:1]))
+    assert (gain.channel, gain.joints) == ("joint torque", ("A5",))
+    assert float(gain.seen.split()[1]) == pytest.approx(1.3, rel=0.03)
+
+
+TIMES = np.arange(0.0, 20.0, 0.004)
+
+
+def of_joints(q: np.ndarray, effort: np.ndarray) -> Session:
+    """A session of the joints J1, J2, ... at `TIMES` with their joint torques alone."""
+    whole, random, stamps = session(rate_hz=250.0), np.random.default_rng(0), np.rint(1e9 * TIMES)
+    names = tuple(f"J{number + 1}" for number in range(q.shape[1]))
+    columns = replace(
+        whole.joint,
+        names=names,
+        log_time=stamps.astype(np.int64),
+        publish_time=stamps.astype(np.int64),
+        sequence=np.arange(1, len(TIMES) + 1),
+        position=q + 1e-5 * random.normal(size=q.shape),
+        velocity=np.zeros((len(TIMES), 0)),
+        effort=effort + 0.05 * random.normal(size=q.shape),
+    )
+    return replace(whole, joint_names=names, joint=columns, motor=None, phases=())
+
+
 def test_the_sign_of_a_single_joint_shows_by_its_inertia() -> None:
-    time, random = np.arange(0.0, 20.0, 0.004), np.random.default_rng(0)
+    time = TIMES[:, None]
     q = np.sin(1.1 * time) + 0.4 * np.sin(2.3 * time + 1.0)
-    qd = np.gradient(q, time)
-    torque = 3.0 * np.gradient(qd, time) + 20.0 * np.cos(q) + 4.0 * qd + 5.0 * np.sign(qd)
-    torque += 0.05 * random.normal(size=len(time))
-    alone = Chain.from_table([{"name": "A1"}], gravity=(0.0, -9.81, 0.0))
-    whole = session(rate_hz=250.0)
-    stamps = np.rint(1e9 * time).astype(np.int64)
-
-    def recorded(sign: float) -> Session:
-        columns = replace(
-            whole.joint,
-            names=("A1",),
-            log_time=stamps,
-            publish_time=stamps,
-            sequence=np.arange(1, len(time) + 1),
-            position=q[:, None] + 1e-5 * random.normal(size=(len(time), 1)),
-            velocity=np.zeros((len(time), 0)),
-            effort=sign * torque[:, None],
-        )
-        return replace(whole, joint_names=("A1",), joint=columns, motor=None, phases=())
-
-    assert screen([recorded(1.0)], alone) == ()
-    (found,) = screen([recorded(-1.0)], alone)
+    qd = np.gradient(q, 0.004, axis=0)
+    effort = 3.0 * np.gradient(qd, 0.004, axis=0) + 20.0 * np.cos(q) + 4.0 * qd + 5.0 * np.sign(qd)
+    alone = Chain.from_table([{"name": "J1"}], gravity=(0.0, -9.81, 0.0))
+    assert screen([of_joints(q, effort)], alone) == ()
+    (found,) = screen([of_joints(q, -effort)], alone)
     assert found.certain
     assert "negative" in found.seen
 
@@ -273,34 +284,49 @@ def test_the_sign_of_a_joint_that_shares_nothing_with_the_others_shows_by_its_in
     rubs: float, certain: bool
 ) -> None:
     """A spindle along a vertical axis and a column that turns about it."""
-    time, random = np.arange(0.0, 20.0, 0.004), np.random.default_rng(0)
-    phase = np.array([0.0, 2.0])
-    q = np.sin(1.1 * time[:, None] + phase) + 0.4 * np.sin(2.3 * time[:, None] + phase)
+    time, phase = TIMES[:, None], np.array([0.0, 2.0])
+    q = np.sin(1.1 * time + phase) + 0.4 * np.sin(2.3 * time + phase)
     qd = np.gradient(q, 0.004, axis=0)
     effort = np.array([5.0, 8.0]) * np.gradient(qd, 0.004, axis=0) + [0.0, 8.0 * 9.81]
-    effort += 0.05 * random.normal(size=q.shape) + rubs * np.sign(qd)
+    effort += rubs * np.sign(qd)
     arm = Chain.from_table([{"name": "J1"}, {"name": "J2", "kind": "prismatic"}], gravity=(0.0, 0.0, -9.81))
-    stamps = np.rint(1e9 * time).astype(np.int64)
-    whole = session(rate_hz=250.0)
-
-    def recorded(sign: float) -> Session:
-        columns = replace(
-            whole.joint,
-            names=("J1", "J2"),
-            log_time=stamps,
-            publish_time=stamps,
-            sequence=np.arange(1, len(time) + 1),
-            position=q + 1e-5 * random.normal(size=q.shape),
-            velocity=np.zeros((len(time), 0)),
-            effort=effort * [1.0, sign],
-        )
-        return replace(whole, joint_names=("J1", "J2"), joint=columns, motor=None, phases=())
-
-    assert screen([recorded(1.0)], arm) == ()
-    (found,) = screen([recorded(-1.0)], arm)
+    assert screen([of_joints(q, effort)], arm) == ()
+    (found,) = screen([of_joints(q, effort * [1.0, -1.0])], arm)
     assert (found.channel, found.joints, found.certain) == ("joint torque", ("J2",), certain)
     assert "its inertia is negative (-8" in found.seen
     assert "kg)" in found.seen
+
+
+PLANAR = """<robot name="planar"><link name="base"/>
+  <joint name="J1" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" velocity="5" effort="200"/></joint>
+  <link name="upper"><inertial><origin xyz="0.2 0.01 0"/><mass value="6"/>
+    <inertia ixx="0.02" iyy="0.09" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="J2" type="revolute"><parent link="upper"/><child link="fore"/><origin xyz="0.4 0 0"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="5" effort="200"/></joint>
+  <link name="fore"><inertial><origin xyz="0.15 -0.01 0"/><mass value="4"/>
+    <inertia ixx="0.01" iyy="0.05" izz="0.05" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+
+
+@pytest.mark.parametrize(
+    ("gains", "joints"),
+    [((1.0, 1.3), ("J2", "J1")), ((0.77, 1.0), ("J1", "J2")), ((1.0, 2.2), ("J2",)), ((0.45, 1.0), ("J1",))],
+)
+def test_of_two_gains_that_fit_alike_the_bodies_of_the_urdf_tell_the_likelier(
+    gains: tuple[float, float], joints: tuple[str, ...]
+) -> None:
+    """Two parallel vertical axes: the second torque too large, or the first too small."""
+    arm, time, phase = Chain.from_urdf(PLANAR), TIMES[:, None], np.array([0.0, 2.0])
+    q = np.sin(1.7 * time + phase) + 0.6 * np.sin(3.1 * time + phase)
+    qd = np.gradient(q, 0.004, axis=0)
+    bodies = arm.urdf_inertials() * [[1.06], [0.94]]
+    effort = torque(arm, q, qd, np.gradient(qd, 0.004, axis=0), bodies)
+    assert screen([of_joints(q, effort)], arm) == ()
+    (found,) = screen([of_joints(q, effort * gains)], arm)
+    assert (found.channel, found.joints) == ("joint torque", joints)
+    listed = dict(re.findall(r"(J\d) is (\S+) times", found.seen)) or {joints[0]: found.seen.split()[1]}
+    right = 1 if gains[0] == 1.0 else 0
+    assert float(listed[f"J{right + 1}"]) == pytest.approx(gains[right], rel=0.03)
 
 
 def test_channels_that_contradict_themselves_are_named(pair: list[Session]) -> None:
