@@ -574,11 +574,19 @@ class _Comparison:
         return values[own], covariance[own, own]
 
     def _gains_of(self, kind: Kind) -> tuple[int, ...]:
-        """Sensors with an error of scale beyond chance, beside all others; none with a single sensor."""
-        if len(self.joints) < 2:
+        """Sensors with an error of scale beyond chance, beside all others and beside the middle one's; none with a
+        single sensor. An error common to most sensors is one of the bodies."""
+        count = len(self.joints)
+        if count < 2:
             return ()
-        values, covariance = self._gains((*kind[:3], tuple(range(len(self.joints)))))
-        return tuple(np.flatnonzero(np.abs(values) > _SURE * np.sqrt(np.diag(covariance))).tolist())
+        values, covariance = self._gains((*kind[:3], tuple(range(count))))
+        middle = np.zeros(count)
+        np.add.at(middle, np.argsort(values)[[(count - 1) // 2, count // 2]], 0.5)
+        beyond = [
+            np.abs(some @ values) > _SURE * np.sqrt(np.diag(some @ covariance @ some.T))
+            for some in (np.eye(count), np.eye(count) - middle)
+        ]
+        return tuple(np.flatnonzero(np.all(beyond, axis=0)).tolist())
 
     def _scores(
         self, used: NDArray[np.int64], weights: Floats, prior: Prior, physical: float | None = None

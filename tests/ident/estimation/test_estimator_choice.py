@@ -135,6 +135,17 @@ def test_a_sensor_that_reads_too_much_is_found_and_stated_as_an_effect():
     assert "joint torque sensors read too much by" in found.summary()
 
 
+def test_an_error_common_to_most_sensors_is_one_of_the_bodies():
+    """Beside a sensor that reads far too little the others' errors have a common part of two per cent."""
+    log = session(sensors=SENSORS, motor=False, periods=3)
+    effort = log.joint.effort.copy()
+    effort[:, 3] *= 0.84
+    found = identify(replace(log, joint=replace(log.joint, effort=effort)), chain(), MODEL_1)
+    assert found.choice is not None
+    assert list(found.choice.gains) == ["A3"]
+    assert found.choice.gains["A3"][0] == pytest.approx(-0.16, abs=0.01)
+
+
 def test_a_sensor_dead_in_one_session_leaves_the_choice_to_the_others():
     first, second = (session(sensors=SENSORS, seed=seed, motor=False) for seed in (1, 2))
     effort = second.joint.effort.copy()
