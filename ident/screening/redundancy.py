@@ -213,6 +213,12 @@ class Normal:
         return np.tensordot(weights, self.matrix, 1) + fit.nominal * self.prior.precision
 
     @property
+    def by_data(self) -> Normal:
+        """The same without the prior, for what the data alone have to tell: a wrong URDF bends what they hardly do."""
+        width = self.matrix.shape[-1]
+        return replace(self, prior=Prior(np.zeros(width), np.zeros((width, width))))
+
+    @property
     def rows(self) -> float:
         """Independent rows of a class, in the mean."""
         return max(float(self.square[:, :, -2, -2].sum()) / (len(self.classes) * _BLOCK), 1.0)
@@ -455,8 +461,9 @@ class Redundancy:
         common = np.full_like(total, np.max(total, initial=0.0) or 1.0)
         # A torque in a wrong unit is far too heavy or far too light in one of these starts, or the URDF is.
         starts = (total, 1.0 / normal.rows), (common, 1.0 / normal.rows), (total, 0.0)
+        most = (3 if normal.prior.precision.any() else 2) if doubtful else 1
         sums = _Sums(mixed, square, total)
-        fits = [_reweighted(normal, sums, *start, rounds) for start in starts[: 3 if doubtful else 1]]
+        fits = [_reweighted(normal, sums, *start, rounds) for start in starts[:most]]
         return min(fits, key=lambda fit: fit.cost)
 
     def _maps(self, normal: Normal) -> Floats:

@@ -204,7 +204,7 @@ def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> tuple[list
         found = [_doubt(one, sessions) for one in explanations]
         normal = data.normal()
         fit = data.fit(normal)
-    found += _physics(data, fit, normal)
+    found += _physics(data, normal.by_data)
     found = (
         found or _positions(data, fit, normal, sessions) or [*_zeros(data, fit, normal), *_of_motors(data)]
     )
@@ -260,7 +260,7 @@ def _of_the_wrong_side(one: Explanation) -> Explanation:
     turned = data
     for side in data.sides:
         turned = turned.mapped(side, scale)
-    fits = [data.fit(), turned.fit()]
+    fits = [each.fit(each.normal().by_data) for each in (data, turned)]
     if len(one.joints) == 1:
         # The other joints may not tell its sign; the difference of its torques is friction and inertia of the drive.
         power = _friction(data, one.joints[0], ("motor",))
@@ -451,8 +451,9 @@ def _inertia(chain: Chain, q: Floats, bodies: Floats) -> Floats:
     return _inertia_rows(chain, q) @ bodies
 
 
-def _physics(data: Redundancy, fit: Fit, normal: Normal) -> list[Doubt]:
+def _physics(data: Redundancy, normal: Normal) -> list[Doubt]:
     """Inertia clearly negative, and gravity of another order than the URDF's."""
+    fit = data.fit(normal)
     n, names = data.chain.n, data.chain.joint_names
     bodies = len(INERTIAL) * n
     rows = np.zeros((n, len(fit.parameters)))
@@ -616,4 +617,5 @@ def _gravity_slopes(data: Redundancy, fit: Fit) -> dict[int, float]:
 
 def _without_inertia(data: Redundancy) -> Fit:
     """The fit without accelerations: a slow motion says nothing about inertia."""
-    return replace(data, rows=tuple(replace(part, qdd=np.zeros_like(part.qdd)) for part in data.rows)).fit()
+    still = replace(data, rows=tuple(replace(part, qdd=np.zeros_like(part.qdd)) for part in data.rows))
+    return still.fit(still.normal().by_data)

@@ -19,8 +19,8 @@ from ident.dynamics.regressor import rigid_regressor, torque
 # Least zero told, largest sought [rad]: centres of mass of a URDF are 2 degrees aside on real arms, 4 on simulated ones
 # with 15 % of error in each coordinate.
 _LEAST, _MOST = float(np.radians(5.0)), 0.5
-# Difference of gravity left with the zero undone: over that before, 0.58 and more on arms without a wrong zero; and
-# over the torque.
+# Difference of gravity left with the zero undone over that before: 0.58 and more on arms without a wrong zero. And over
+# the torque, as right as a URDF is: a smaller one contradicts nothing, a larger one remains unexplained.
 _LEFT, _RIGHT = 0.45, 0.1
 # Least power of gravity in a joint over the largest.
 _BEARING = 1e-4
@@ -67,4 +67,4 @@ def zero_by_gravity(chain: Chain, q: Floats, bodies: Floats, nominal: Floats) ->
             best = GravityZero(joint, -float(found.x), left(joint, 0.0), float(found.fun))
     if best is None or abs(best.size) < _LEAST:
         return None
-    return best if best.after < min(_LEFT * best.before, _RIGHT) else None
+    return best if best.after < min(_LEFT * best.before, _RIGHT) and best.before > _RIGHT else None
