@@ -68,6 +68,8 @@ _SURE = 2.0
 _UPRIGHT = 1e-3
 # Errors this close to one another count as equal, and so much of a joint's torque as nothing.
 _ALIKE = 0.01
+# Squared error over the squared torque of a candidate that predicts no better than a torque of zero.
+_NOTHING = 1.0
 _PLAIN = CovarianceSettings(kind="textbook")
 
 Kind = tuple[str, float | None, bool, tuple[int, ...]]
@@ -426,12 +428,13 @@ class _Comparison:
                 f"{self.placeholder}: a placeholder, so its inertials are no knowledge of this arm; give a URDF with "
                 "the manufacturer's inertials, or choose `--estimator wls`"
             )
+        unknown = Candidate(
+            "physical" if bodies else "wls", 1.0 if bodies else None, tilted[0], (), math.nan, {}
+        )
+        uncompared = Choice((unknown,), 0, 0, self.block_s, excluded, self._disagreement())
         if len(self.held) < 2:
-            unknown = Candidate(
-                "physical" if bodies else "wls", 1.0 if bodies else None, tilted[0], (), math.nan, {}
-            )
             text = f"not compared: the motion is too short for parts of {self.block_s:.1f} s to be held back"
-            return Choice((unknown,), 0, 0, self.block_s, excluded, self._disagreement(), (text, *advice))
+            return replace(uncompared, advice=(text, *advice))
         found: dict[Kind, Floats] = {}
         best = list[Kind]()
         for tilt in tilted if bodies else ():
@@ -446,6 +449,9 @@ class _Comparison:
         if not best:
             raise DataError(f"no estimator can be compared on these data: {'; '.join(excluded)}")
         chosen = self._preferred(best, found)
+        if self._share(found[chosen]).sum() >= _NOTHING:
+            text = f"not compared: the motion is too short to predict parts of {self.block_s:.1f} s from the others"
+            return replace(uncompared, excluded=excluded, advice=(text, *advice))
         kinds = sorted(found, key=lambda kind: (math.inf if kind[1] is None else kind[1], kind[2:]))
         squares = np.array([found[kind] for kind in kinds])
         share = np.array([self._share(square) for square in squares])
@@ -511,8 +517,11 @@ class _Comparison:
 
     def _pays(self, before: Floats, after: Floats, sure: float) -> bool:
         """Whether squared errors (parts, classes) fall by a percent and by `sure` standard errors."""
+        worst, least = self._share(before).sum(), self._share(after).sum()
+        if worst >= _NOTHING:
+            return bool(least < _NOTHING)
         gain, std = _paired((self._share(before) - self._share(after))[None])
-        alike = (1.0 - (1.0 - _ALIKE) ** 2) * self._share(before).sum()
+        alike = (1.0 - (1.0 - _ALIKE) ** 2) * worst
         return bool(gain[0] > max(sure * std[0], alike))
 
     def _share(self, squares: Floats) -> Floats:

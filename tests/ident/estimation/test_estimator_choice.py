@@ -11,7 +11,7 @@ import pytest
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
-from ident.estimation.choice import _BesideGains, choose
+from ident.estimation.choice import Kind, _BesideGains, _Comparison, choose
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.parts import PARTS, beside, held_back_parts
 from ident.estimators import MaximumAPosteriori, Prior, Problem, RowGroup, WeightedLeastSquares
@@ -85,6 +85,27 @@ def test_a_good_prior_wins_and_the_text_says_by_how_much():
         f"{name} joint" for name in chain().joint_names
     }
     assert found.settings.estimator == "auto"
+
+
+@pytest.mark.parametrize(("wls", "winner"), [(0.5, "wls"), (3.0, "physical")])
+def test_what_predicts_no_better_than_zero_is_no_choice(
+    monkeypatch: pytest.MonkeyPatch, wls: float, winner: str
+) -> None:
+    """A part of a short motion, estimated from the others, may be off by any factor; one part with most of the error
+    has no significant difference."""
+
+    def errors(self: _Comparison, kind: Kind) -> np.ndarray:
+        torque = self.held[:, :, -1, -1].sum(axis=0)
+        share = np.zeros(len(self.held))
+        share[0] = wls if kind[0] == "wls" else 1e6
+        return share[:, None] * torque
+
+    monkeypatch.setattr(_Comparison, "_errors", errors)
+    found = choose([session(sensors=SENSORS, motor=False, periods=3)], chain(), MODEL_1, tilt=False)
+    assert found.choice is not None
+    assert found.choice.winner.estimator == winner
+    assert ("not compared" in " ".join(found.choice.advice)) == (winner == "physical")
+    assert np.isnan(found.choice.winner.held_back_percent) == (winner == "physical")
 
 
 def test_a_tilt_is_found_where_it_helps():
