@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
@@ -40,6 +39,8 @@ def zero_by_gravity(chain: Chain, q: Floats, bodies: Floats, nominal: Floats) ->
 
     q : (N, n) poses. bodies : (10 n,) identified, nominal : of the URDF.
     """
+    from scipy.optimize import minimize_scalar  # on use: its import is slow
+
     still = np.zeros_like(q)
     identified = (rigid_regressor(chain, q, still, still) @ bodies).T
     identified = identified - identified.mean(axis=0)
