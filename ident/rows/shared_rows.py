@@ -7,6 +7,7 @@ enough for a model file.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,25 +56,44 @@ def _numbers(columns: Sequence[Floats]) -> Numbers:
     return found
 
 
-def shared_but_for_rounding(a: Session, b: Session) -> float:
-    """Share of the rows of the shorter log that are in the other to four digits of each column's range.
+class Cells:
+    """The rows of logs in cells of the first one's ranges, made once a log: pairs of them are compared."""
 
-    Two measurements of one motion differ by the noise of all sensors, which is more.
-    """
-    sides = _columns(a), _columns(b)
-    if len(sides[0]) != len(sides[1]):
-        return 0.0
-    scales = [ROUNDED * float(np.ptp(column)) for column in sides[0]]
-    moving = [k for k, scale in enumerate(scales) if scale > 0.0]
-    if not moving:
-        return 0.0
-    # Wide cells, so that few rows are rounded into the next one.
-    cells = [_numbers([np.floor(own[k] / (_CELL * scales[k])) + 0.0 for k in moving]) for own in sides]
-    _, first, second = np.intersect1d(cells[0], cells[1], return_indices=True)
-    alike = np.ones(len(first), dtype=bool)
-    for k in moving:
-        alike &= np.abs(sides[0][k][first] - sides[1][k][second]) <= scales[k]
-    return float(np.count_nonzero(alike)) / min(len(np.unique(own)) for own in cells)
+    def __init__(self, first: Session) -> None:
+        self._first = first
+        self._known: dict[int, tuple[Numbers, NDArray[np.intp]]] = {}
+
+    @cached_property
+    def _scales(self) -> list[float]:
+        return [ROUNDED * float(np.ptp(column)) for column in _columns(self._first)]
+
+    def shared(self, a: Session, b: Session) -> float:
+        """Share of the rows of the shorter log that are in the other to four digits of each column's range.
+
+        Two measurements of one motion differ by the noise of all sensors, which is more.
+        """
+        sides = _columns(a), _columns(b)
+        moving = [k for k, scale in enumerate(self._scales) if scale > 0.0]
+        if not moving or {len(self._scales)} != {len(columns) for columns in sides}:
+            return 0.0
+        (one, places), (other, others) = (
+            self._of(session, columns, moving) for session, columns in zip((a, b), sides, strict=True)
+        )
+        _, first, second = np.intersect1d(one, other, assume_unique=True, return_indices=True)
+        alike = np.ones(len(first), dtype=bool)
+        for k in moving:
+            alike &= np.abs(sides[0][k][places[first]] - sides[1][k][others[second]]) <= self._scales[k]
+        return float(np.count_nonzero(alike)) / min(len(one), len(other))
+
+    def _of(
+        self, session: Session, columns: Sequence[Floats], moving: Sequence[int]
+    ) -> tuple[Numbers, NDArray[np.intp]]:
+        """Sorted numbers of the cells of a log, and a row in each. Wide cells, so that few rows are rounded into the
+        next one."""
+        if id(session) not in self._known:
+            cells = _numbers([np.floor(columns[k] / (_CELL * self._scales[k])) + 0.0 for k in moving])
+            self._known[id(session)] = np.unique(cells, return_index=True)
+        return self._known[id(session)]
 
 
 def shared(a: Numbers, b: Numbers) -> float:

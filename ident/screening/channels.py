@@ -24,7 +24,7 @@ from ident.rows.data_quality import (
     run_bounds,
     stuck_at,
 )
-from ident.rows.shared_rows import ROUNDED, SAME_ROWS, row_numbers, shared, shared_but_for_rounding
+from ident.rows.shared_rows import ROUNDED, SAME_ROWS, Cells, row_numbers, shared
 from ident.screening.doubts import LATE_S, MEND_TIME, Doubt
 from lwr_driver.session import JointColumns, Session
 from lwr_driver.session.spool import column
@@ -126,10 +126,11 @@ def _torques(session: Session) -> Iterator[tuple[str, JointColumns]]:
 
 def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
     numbers = {id(session): row_numbers(session) for session in sessions} if len(sessions) > 1 else {}
+    cells = Cells(sessions[0])
     for a, b in combinations(sessions, 2):
         share, how = shared(numbers[id(a)], numbers[id(b)]), ""
         if share <= SAME_ROWS:
-            share, how = shared_but_for_rounding(a, b), ", rounded otherwise"
+            share, how = cells.shared(a, b), ", rounded otherwise"
         uid = a.metadata.get("uid", "")
         alike = f" and the uid {uid}" if uid and uid == b.metadata.get("uid", "") else ""
         names = f"{a.path.name} and {b.path.name}"

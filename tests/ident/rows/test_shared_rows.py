@@ -9,12 +9,12 @@ import pytest
 
 from ident.rows.shared_rows import (
     SAME_ROWS,
+    Cells,
     from_marks,
     marks,
     row_numbers,
     seen_before,
     shared,
-    shared_but_for_rounding,
 )
 from lwr_driver.session import Session
 from tests.ident import estimation_arm as arm
@@ -53,7 +53,7 @@ def test_another_recording_of_the_motion_shares_none(log: Session) -> None:
     assert shared(row_numbers(log), row_numbers(again)) == 0.0
     assert not seen_before(again, [from_marks(marks(log))])
     assert not seen_before(log, [])
-    assert shared_but_for_rounding(log, again) == 0.0
+    assert Cells(log).shared(log, again) == 0.0
 
 
 def rounded(session: Session, digits: int) -> Session:
@@ -67,8 +67,8 @@ def test_a_copy_or_a_part_with_rounded_values_shares_most_rows(log: Session) -> 
     for digits in (4, 6):
         copy = rounded(cut(log, 1000, 3000), digits)
         assert shared(row_numbers(log), row_numbers(copy)) < SAME_ROWS
-        assert shared_but_for_rounding(log, copy) > 0.5
-        assert shared_but_for_rounding(copy, log) > 0.5
+        assert Cells(log).shared(log, copy) > 0.5
+        assert Cells(copy).shared(copy, log) > 0.5
 
 
 def test_marks_are_a_fair_sample(log: Session) -> None:
