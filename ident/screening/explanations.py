@@ -83,38 +83,44 @@ def unit_of(factor: float, *, torque: bool = False) -> str:
 
 
 def explain(
-    data: Redundancy, believed: Callable[[Explanation, int], bool]
-) -> tuple[list[Explanation], Redundancy]:
-    """Explanations, the strongest first, and the mended rows, until these contradict themselves no more.
+    data: Redundancy, fit: Fit, normal: Normal, believed: Callable[[Explanation, int], bool]
+) -> list[Explanation]:
+    """Explanations, the strongest first, until the rows as mended by the last one contradict themselves no more.
 
     believed : of an explanation and the number of classes, whether it gains enough.
     """
     found: list[Explanation] = []
     for _ in range(data.chain.n):
-        best = _best(data, believed)
+        gains = data.gains(fit, normal)
+        if not _contradicts(data, fit, normal, gains):
+            break
+        best = _best(data, fit, normal, gains, believed)
         # What is left of a mended channel is the coarseness of its mending.
         if best is None or any(one.channel == best.channel and one.joints == best.joints for one in found):
             break
         found.append(best)
         data = best.mended
         normal = data.normal()
-        if not contradicts(data, data.fit(normal), normal):
-            break
-    return found, data
+        fit = data.fit(normal)
+    return found
 
 
-def contradicts(data: Redundancy, fit: Fit, normal: Normal) -> bool:
+def _contradicts(data: Redundancy, fit: Fit, normal: Normal, gains: Mapping[Class, Gain]) -> bool:
     """Whether a joint disagrees with the others, a gain is wrong, or a part of the data has an error of its own."""
     return (
         max(fit.rho.values()) > AGREES
-        or any(map(is_wrong, data.gains(fit, normal).values()))
+        or any(map(is_wrong, gains.values()))
         or bool(part_errors(data, fit, normal))
     )
 
 
-def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Explanation | None:
-    normal = data.normal()
-    fit = data.fit(normal)
+def _best(
+    data: Redundancy,
+    fit: Fit,
+    normal: Normal,
+    gains: Mapping[Class, Gain],
+    believed: Callable[[Explanation, int], bool],
+) -> Explanation | None:
     before, tried = fit.score, []
 
     def scored(candidate: Explanation) -> tuple[Explanation, Fit]:
@@ -123,7 +129,6 @@ def _best(data: Redundancy, believed: Callable[[Explanation, int], bool]) -> Exp
         after = candidate.mended.fit(normal if mapped else None, doubtful=False)
         return replace(candidate, drop=before - after.score), after
 
-    gains = data.gains(fit, normal)
     for candidate in _likely(_torques(data, gains), normal):
         one, after = scored(candidate)
         tried.append(one)

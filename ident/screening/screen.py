@@ -30,7 +30,7 @@ from ident.rows.filters import SignalSettings
 from ident.rows.sessions import payload_name, stated_mass
 from ident.screening.channels import check_channels, check_limits, dead
 from ident.screening.doubts import MEND_TIME, Doubt, settle
-from ident.screening.explanations import AGREES, Explanation, contradicts, explain, unit_of
+from ident.screening.explanations import AGREES, Explanation, explain, unit_of
 from ident.screening.positions import KINDS, leaning, position_errors
 from ident.screening.redundancy import FLOOR, Class, Fit, Normal, Part, Redundancy
 from ident.screening.zeros import zero_by_gravity
@@ -195,13 +195,12 @@ def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> tuple[list
     """Doubts, the score that is left with the explanations undone, and whether all joints agree as recorded."""
     normal = data.normal()
     fit = data.fit(normal)
-    found: list[Doubt] = []
     agree = max(fit.rho.values()) <= AGREES
-    if contradicts(data, fit, normal):
-        explanations, data = explain(data, _supported)
-        explanations = [_of_the_wrong_label(_of_the_wrong_side(one), sessions) for one in explanations]
-        data = explanations[-1].mended if explanations else data
-        found = [_doubt(one, sessions) for one in explanations]
+    explanations = explain(data, fit, normal, _supported)
+    explanations = [_of_the_wrong_label(_of_the_wrong_side(one), sessions) for one in explanations]
+    found = [_doubt(one, sessions) for one in explanations]
+    if explanations:
+        data = explanations[-1].mended
         normal = data.normal()
         fit = data.fit(normal)
     found += _physics(data, normal.by_data)
