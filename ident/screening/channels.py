@@ -125,8 +125,9 @@ def _torques(session: Session) -> Iterator[tuple[str, JointColumns]]:
 
 
 def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
-    numbers = {id(session): row_numbers(session) for session in sessions} if len(sessions) > 1 else {}
-    cells = Cells(sessions[0])
+    if len(sessions) < 2:
+        return
+    numbers, cells = {id(session): row_numbers(session) for session in sessions}, Cells(sessions[0])
     for a, b in combinations(sessions, 2):
         share, how = shared(numbers[id(a)], numbers[id(b)]), ""
         if share <= SAME_ROWS:

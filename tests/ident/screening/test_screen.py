@@ -345,6 +345,7 @@ def test_channels_that_contradict_themselves_are_named(pair: list[Session]) -> N
     units = found(with_speed(None, 180.0 / np.pi, *chain().joint_names))
     assert (units.channel, units.certain) == ("velocity", False)
     assert check_channels(with_speed()(pair), chain()) == []
+    assert check_channels([], chain()) == []
 
 
 @pytest.mark.parametrize("side", ["joint", "motor"])
