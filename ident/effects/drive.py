@@ -538,7 +538,7 @@ class ScaleError(Effect):
         Parameter("error", "1", "relative error of the scale", low=-0.9, high=2.0, share=True),
     )
     depends_on = "load"
-    law = Law("load")
+    law = Law("load", exact=True)
     experiment = Discriminator.STATIC_POSES
     every_payload = True
     usual_change = 0.01 / 3.0**0.5  # within a per cent, evenly

@@ -60,11 +60,13 @@ class Discriminator(StrEnum):
 class Law:
     """The variable of a law: its model-form error is a function of the same variable.
 
-    signed : the law scales a torque with the sign of the drive's direction.
+    signed : the law scales a torque with the sign of the drive's direction. exact : it holds by definition, so any
+    other function of its variable is another cause.
     """
 
     variable: Literal["q", "qd", "load", "time"]
     signed: bool = False
+    exact: bool = False
 
 
 @dataclass(frozen=True)

@@ -339,6 +339,20 @@ def test_scale_that_follows_another_angle_is_no_sure_gain(
 
 
 @pytest.mark.slow
+def test_a_sensor_that_reads_less_the_more_it_is_loaded_is_no_sure_gain(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def bent(s: Signals) -> None:
+        s["joint"][:, 1] *= 1.0 - 0.004 * np.abs(s["joint"][:, 1])
+
+    found = diagnose(pair(make, bent), chain, reference=reference)
+    assert all(f.confidence < 0.8 for f in found.claims)
+    rest = (*found.nameless, *found.unexplained)
+    (left,) = [u for u in rest if u.joint == 2 and u.side == "joint"]
+    assert "load2" in left.depends_on
+
+
+@pytest.mark.slow
 def test_friction_that_follows_the_acceleration_is_not_named_with_confidence(
     make: Make, chain: Chain, reference: Reference
 ) -> None:
