@@ -262,9 +262,11 @@ class _Bench:
                         len(self.columns),
                     )
         if not found:
+            most = max(len(session.joint) for session in self.sessions)
             raise DataError(
-                f"no interval of {1e3 * BIN_S:.0f} ms in {len(self.sessions)} sessions has all samples of a torque: "
-                "too many are lost by the counter, or flagged; record without losses, or import without the counter"
+                f"no interval of {1e3 * BIN_S:.0f} ms in sessions of up to {most} samples has all samples of a "
+                "torque: they are too short, or too many samples are lost by the counter or flagged; record longer "
+                "ones without losses, or import without the counter"
             )
         return found
 

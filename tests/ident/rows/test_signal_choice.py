@@ -53,7 +53,14 @@ def test_a_recording_with_holes_in_every_interval_is_refused_with_advice():
     joint = dataclasses.replace(
         session.joint, **{name: getattr(session.joint, name)[kept] for name in fields}
     )
-    with pytest.raises(DataError, match=r"lost by the counter.*record without losses"):
+    with pytest.raises(DataError, match=r"lost by the counter.*without losses"):
+        chosen(dataclasses.replace(session, joint=joint))
+
+
+def test_a_recording_of_a_few_samples_is_said_to_be_too_short():
+    session = arm.session(motor=False, sensors=sensors(), rate_hz=50.0, period_s=4.0, periods=1)
+    joint = session.joint.rows(0, int(session.joint.log_time[25]))
+    with pytest.raises(DataError, match=r"up to 25 samples.*too short.*record longer"):
         chosen(dataclasses.replace(session, joint=joint))
 
 
