@@ -22,9 +22,9 @@ from ident.dynamics.parameters import LINK_FRICTION
 from ident.dynamics.structure import Coupling
 from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
-from ident.screening.channels import asked_to_move
 from ident.screening.doubts import Doubt, settle
 from ident.screening.screen import screen
+from ident.screening.stuck import asked_to_move
 from lwr_driver.session import Session
 
 _TORQUES = ("joint torque", "motor torque")

@@ -7,9 +7,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from fri.errors import DataError
+from lwr_driver.session import JointColumns, Session
 
 LATE_S = 0.01
 """Least delay of a position of interest [s]: see `positions`."""
+MOVED = 0.05
+"""Least movement of a joint of interest [rad or m]."""
 MEND_TIME = "shift the column by that time before the import, or record it with the stamps of its own samples"
 
 
@@ -40,6 +43,13 @@ class Doubt:
     def __str__(self) -> str:
         looks = f", looks like {self.looks_like}" if self.looks_like else ""
         return f"{self.subject}: {self.seen}{looks}; {self.mend}"
+
+
+def torques_of(session: Session) -> Iterator[tuple[str, JointColumns]]:
+    """Torque channels of a session that hold any, by the name that a doubt gives them."""
+    for channel, columns in (("joint torque", session.joint), ("motor torque", session.motor)):
+        if columns is not None and columns.effort.size:
+            yield channel, columns
 
 
 def doubted_joints(doubts: Sequence[Doubt]) -> frozenset[str]:

@@ -28,11 +28,13 @@ from ident.estimators.problem import Problem
 from ident.rows.content import Kept, Recall
 from ident.rows.filters import SignalSettings
 from ident.rows.sessions import payload_name, stated_mass
-from ident.screening.channels import check_channels, check_limits, dead
+from ident.screening.channels import check_channels
 from ident.screening.doubts import MEND_TIME, Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, explain, unit_of
+from ident.screening.limits import check_limits
 from ident.screening.positions import KINDS, leaning, position_errors
 from ident.screening.redundancy import FLOOR, Class, Fit, Normal, Part, Redundancy
+from ident.screening.stuck import dead
 from ident.screening.zeros import zero_by_gravity
 from lwr_driver.session import Session, Sessions, as_sessions
 

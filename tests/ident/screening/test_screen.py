@@ -31,9 +31,10 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
 from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
-from ident.screening.channels import check_channels, check_limits
+from ident.screening.channels import check_channels
 from ident.screening.doubts import Doubt, explaining, late_positions, settle
 from ident.screening.explanations import unit_of
+from ident.screening.limits import check_limits
 from ident.screening.positions import position_errors
 from ident.screening.screen import _in_bands, require_sound, screen, without_dead
 from lwr_driver.session import Session
