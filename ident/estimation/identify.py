@@ -398,7 +398,7 @@ def identify(
     require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
     require(settings, IdentificationSettings, "settings", "make one with `IdentificationSettings(model=2)`")
     if settings.estimator == AUTO:
-        from ident.estimation.choice import choose
+        from ident.estimation.choose import choose
 
         return choose(sessions, chain, settings, known=known)
     rows = observed(sessions, chain, settings, known=known)

@@ -167,7 +167,7 @@ def command(
     mounting = None
     status.show("estimating the model")
     if estimator == AUTO:
-        from ident.estimation.choice import choose
+        from ident.estimation.choose import choose
 
         found = choose(logs, chain, wanted, tilt=tilt or None)
     elif tilt:

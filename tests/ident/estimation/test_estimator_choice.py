@@ -11,7 +11,8 @@ import pytest
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
-from ident.estimation.choice import Kind, _BesideGains, _Comparison, choose
+from ident.estimation.choose import BesideGains, choose
+from ident.estimation.comparison import EstimatorComparison, Kind
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.parts import PARTS, beside, held_back_parts
 from ident.estimators import MaximumAPosteriori, Prior, Problem, RowGroup, WeightedLeastSquares
@@ -94,13 +95,13 @@ def test_what_predicts_no_better_than_zero_is_no_choice(
     """A part of a short motion, estimated from the others, may be off by any factor; one part with most of the error
     has no significant difference."""
 
-    def errors(self: _Comparison, kind: Kind) -> np.ndarray:
+    def errors(self: EstimatorComparison, kind: Kind) -> np.ndarray:
         torque = self.held[:, :, -1, -1].sum(axis=0)
         share = np.zeros(len(self.held))
         share[0] = wls if kind[0] == "wls" else 1e6
         return share[:, None] * torque
 
-    monkeypatch.setattr(_Comparison, "_errors", errors)
+    monkeypatch.setattr(EstimatorComparison, "_errors", errors)
     found = choose([session(sensors=SENSORS, motor=False, periods=3)], chain(), MODEL_1, tilt=False)
     assert found.choice is not None
     assert found.choice.winner.estimator == winner
@@ -125,7 +126,7 @@ def test_a_tilt_is_found_where_it_helps():
 def test_an_earlier_choice_is_taken_for_other_sessions_and_estimates_anew(monkeypatch: pytest.MonkeyPatch):
     first = chosen(kilogrammes=4.0).choice
     assert first is not None
-    monkeypatch.setattr("ident.estimation.choice.compared", None)
+    monkeypatch.setattr("ident.estimation.choose.compared", None)
     again = choose([session(sensors=SENSORS, motor=False, seed=7)], chain(), MODEL_1, like=first)
     assert again.choice is not None
     assert again.choice.winner == first.winner
@@ -191,7 +192,7 @@ def test_a_joint_that_a_gain_explains_weighs_by_what_is_left():
     # The moment about A3 carries the uncertainty of its sensor.
     place = found.base.names.index("MY4R")
     plain = WeightedLeastSquares().fit(found.problem)
-    wide = _BesideGains(WeightedLeastSquares(), {"A3": (0.0, 0.05)}, np.array([[0.05**2]])).fit(found.problem)
+    wide = BesideGains(WeightedLeastSquares(), {"A3": (0.0, 0.05)}, np.array([[0.05**2]])).fit(found.problem)
     added = np.sqrt(wide.std[place] ** 2 - plain.std[place] ** 2)
     assert 0.01 * abs(plain.values[place]) < added < 0.05 * abs(plain.values[place])
 
