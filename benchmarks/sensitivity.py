@@ -5,8 +5,9 @@
     python -m benchmarks.sensitivity campaign --report
 
 The numbers are the constants of `ident/diagnosis` and the settings of `DiagnosisSettings`. A verdict is the cause and
-joint named first and whether it is said for sure; silence is one, too. Logs and references are those of the campaign;
-a number with its result in `sensitivity.jsonl` is not tried again.
+joint named first and whether it is said for sure; silence is one, too. Logs and references are those of the campaign,
+but for the numbers of the commissioning, which make the reference anew; a number with its result in
+`sensitivity.jsonl` is not tried again.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import importlib
 import json
 import logging
 import pkgutil
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,8 +41,20 @@ from tests.hidden_physics.verdict import SURE
 
 FACTORS = (0.5, 2.0)
 _SETTINGS = "settings"
-# Not decisions: seeds, and what only the text shows.
-_LEFT_OUT = ("seed", "SCHEMA_VERSION", "_WIDTH", "_REPR_LINES")
+# Not decisions: seeds, the size of a piece of work, and what only the text shows.
+_LEFT_OUT = (
+    "seed",
+    "jobs",
+    "SCHEMA_VERSION",
+    "_WIDTH",
+    "_REPR_LINES",
+    "_BLOCK",
+    "_TOGETHER",
+    "_DENSE",
+    "_LATEST",
+)
+_IN_WORDS = ("claims_in_words", "look_alikes", "statements")
+_OF_REFERENCE = ("character", "commission")
 
 
 @dataclass(frozen=True)
@@ -62,6 +76,8 @@ def numbers() -> Iterator[Number]:
         if isinstance(value, (int, float)) and not isinstance(value, bool) and field.name not in _LEFT_OUT:
             yield Number(_SETTINGS, field.name, value)
     for module in pkgutil.iter_modules(ident.diagnosis.__path__):
+        if module.name in _IN_WORDS:
+            continue
         loaded = importlib.import_module(f"ident.diagnosis.{module.name}")
         for name, value in vars(loaded).items():
             own = name.isupper() and name not in _LEFT_OUT and _is_own(loaded, name)
@@ -92,7 +108,8 @@ def _tried(
     logging.getLogger("ident").setLevel(logging.ERROR)
     value = number.value * factor
     changed = type(number.value)(max(round(value), 1)) if isinstance(number.value, int) else value
-    with _changed(number, changed):
+    with _changed(number, changed), tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) if number.module in _OF_REFERENCE else None
         flips = []
         for result in cases:
             store = store_of(out, result.get("era", 0))
@@ -105,7 +122,9 @@ def _tried(
                 encoder=encoder,
             )
             try:
-                told, _ = diagnosed(store.sessions(case), commissioned(store, case.day.encoder, days))
+                told, _ = diagnosed(
+                    store.sessions(case), commissioned(store, case.day.encoder, days, folder=place)
+                )
                 now = verdict(told["findings"])
             except Exception as error:
                 now = f"{type(error).__name__}: {error}"
@@ -151,16 +170,20 @@ class _changed:
 @click.command()
 @click.argument("out", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--cases", default=20, show_default=True, help="Number of cases of the campaign.")
+@click.option("--case", "seeds", type=int, multiple=True, help="These cases in place of the first, by seed.")
 @click.option("--days", default=2, show_default=True, help="Days of its reference.")
 @click.option("--only", default="", help="Only numbers with this in their name.")
 @click.option("--jobs", default=1, show_default=True)
 @click.option("--report", is_flag=True, help="Run nothing.")
-def main(out: Path, cases: int, days: int, only: str, jobs: int, report: bool) -> None:
+def main(
+    out: Path, cases: int, seeds: tuple[int, ...], days: int, only: str, jobs: int, report: bool
+) -> None:
     """Double and halve every number of the diagnosis."""
     path = out / "sensitivity.jsonl"
     done = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
     if not report:
-        chosen = [r for r in read_results(out / "results.jsonl") if "crash" not in r][:cases]
+        known_cases = [r for r in read_results(out / "results.jsonl") if "crash" not in r]
+        chosen = [r for r in known_cases if r["truth"]["seed"] in seeds] if seeds else known_cases[:cases]
         known = {(one["number"], one["factor"]) for one in done}
         wanted = [(n, f) for n in numbers() for f in FACTORS if only in str(n) and (str(n), f) not in known]
         work = Parallel(n_jobs=jobs, return_as="generator_unordered")

@@ -45,10 +45,15 @@ def healthy_sets(
 
 
 def commissioned(
-    store: Store, encoder: Encoder, days: int = COMMISSIONING_DAYS, schedules: Sequence[str] = SCHEDULES
+    store: Store,
+    encoder: Encoder,
+    days: int = COMMISSIONING_DAYS,
+    schedules: Sequence[str] = SCHEDULES,
+    *,
+    folder: Path | None = None,
 ) -> Path:
-    """Reference of the healthy arm as a model file, made once a store."""
-    path = store.folder / f"reference_{encoder}_{''.join(schedules)}_{days}.yaml"
+    """Reference of the healthy arm as a model file, made once a folder, that of the store by default."""
+    path = (folder or store.folder) / f"reference_{encoder}_{''.join(schedules)}_{days}.yaml"
     if path.is_file():
         return path
     chain, data = _arm()
