@@ -516,6 +516,7 @@ def _setting(nominal: Nominal, *, compared: bool) -> Setting:
         standstill_rad_s=nominal.settings.standstill_rad_s,
         compared=compared,
         compliance=arm.compliance if all(m.springs is not None for m in motions) else None,
+        twist=arm.compliance if arm.encoder == "link" else None,
         clipped=sensor_limits([r for r in nominal.recordings if not r.test], arm.chain.n),
         pauses=_apart(nominal),
     )

@@ -280,7 +280,7 @@ class Nominal:
         n = self.arm.chain.n
         dt = float(stretch.time[1] - stretch.time[0])
         q, qd, qdd = stretch.q, stretch.qd, stretch.qdd
-        speed, acceleration, springs = qd, qdd, None
+        speed, acceleration, springs, motor_q = qd, qdd, None, None
         if np.any(self.arm.compliance > 0.0):
             # A measured torque is noisy, and its second derivative more so; a predicted one is not.
             wanted = self.settings.deflection_hz if bodies is not None else 20.0
@@ -295,7 +295,7 @@ class Nominal:
                     (q[some] - twist, qd[some] - first, qdd[some] - second)
                     for some, twist, first, second in twisted
                 )
-                speed, acceleration = stretch.qd, stretch.qdd
+                speed, acceleration, motor_q = stretch.qd, stretch.qdd, stretch.q
                 if bodies is not None and drive is not None:
                     q, qd, qdd, springs = self._hanging(stretch, q, qd, bodies, drive)
                     link_torque = self._link_torque(q, qd, qdd, bodies, drive)
@@ -324,6 +324,7 @@ class Nominal:
             link_coulomb=values["Fcl"],
             motor_coulomb=values["Fcm"],
             friction=lambda v: values["Fvm"] * v + values["Fcm"] * np.sign(v),
+            motor_q=motor_q,
             slip=slip,
             springs=springs,
             loaded=recording.payload is not None or all(r.payload is None for r in self.recordings),

@@ -441,7 +441,8 @@ _ANSWER = 0.4
 class _Ripple(Form):
     BY_DIRECTION = (
         "by direction",
-        *("cosine", "sine", "cosine_backward", "sine_backward", "cycles_per_turn", "gear_ratio", "delay"),
+        *("cosine", "sine", "cosine_backward", "sine_backward"),
+        *("cycles_per_turn", "gear_ratio", "delay", "compliance"),
     )
 
 
@@ -452,8 +453,9 @@ _RIPPLE_DELAYS = (0.0, 0.01, 0.025, 0.045)
 
 
 class GearRipple(Effect):
-    """Motor torque `cosine cos(k N q) + sine sin(k N q)`, N the gear ratio.
+    """Motor torque `cosine cos(k N q) + sine sin(k N q)`, N the gear ratio, q the angle of the motor.
 
+    Where the links' positions are published, the motor is ahead of its link by `compliance` times the joint torque.
     By direction, forward and backward motion have a cosine and a sine each, since the teeth touch with their other
     flanks, and the angle is that of `delay` ago, for a current that comes late.
     """
@@ -472,9 +474,17 @@ class GearRipple(Effect):
         Parameter("cycles_per_turn", "1/turn of the motor", "k", shape=True, fixed=True),
         Parameter("gear_ratio", "1", "N", shape=True, fixed=True),
         Parameter("delay", "s", "of the ripple against the angle", shape=True, low=0.0, high=0.1),
+        Parameter(
+            "compliance",
+            "rad/Nm",
+            "twist of the joint between published link and motor",
+            shape=True,
+            optional=True,
+            fixed=True,
+        ),
     )
     forms = _Ripple
-    plain = ("cosine", "sine", "cycles_per_turn", "gear_ratio")
+    plain = ("cosine", "sine", "cycles_per_turn", "gear_ratio", "compliance")
     depends_on = "motor angle"
     law = Law("q")
     confused_with = ("sensor_ripple", "friction_position", "motor_torque_delay")
@@ -486,14 +496,17 @@ class GearRipple(Effect):
         ratio = float(setting.gear_ratio[joint])
         if ratio <= 1.0:
             return []
-        plain = [Shape(cycles_per_turn=k, gear_ratio=ratio) for k in (1.0, 2.0)]
+        twist = 0.0 if setting.twist is None else float(setting.twist[joint])
+        elastic = {"compliance": twist} if twist > 0.0 else {}
+        plain = [Shape(cycles_per_turn=k, gear_ratio=ratio).at(**elastic) for k in (1.0, 2.0)]
         delayed = product(plain, _RIPPLE_DELAYS)
         return [*plain, *(Shape(_Ripple.BY_DIRECTION, **one, delay=delay) for one, delay in delayed)]
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Cosine and sine in the motor torque, of each direction if they differ."""
+        here = motion.motor_angle(joint, shape.get("compliance", 0.0))
         late = shape.get("delay", 0.0) * motion.motor_speed[:, joint]
-        angle = shape["cycles_per_turn"] * shape["gear_ratio"] * (motion.q[:, joint] - late)
+        angle = shape["cycles_per_turn"] * shape["gear_ratio"] * (here - late)
         waves = np.cos(angle), np.sin(angle)
         if shape.form is None:
             return tuple(Column(motor=one) for one in waves)

@@ -169,8 +169,9 @@ class Setting:
         with the published positions, None if unknown. presliding : (n,) presliding length of the model [rad],
         None if unknown. standstill_rad_s : rows below this speed are left out. compared : whether the sessions are
         compared with a reference. compliance : (n,) [rad/Nm] of the springs behind published motors, None if the
-        links' positions are published. clipped : (n,) torque limit seen in the samples of a joint's sensor [Nm], NaN
-        for none. pauses : whether the sessions follow one another by their clock, with pauses.
+        links' positions are published. twist : (n,) [rad/Nm] of the motors ahead of published links, None if the
+        motors' positions are published. clipped : (n,) torque limit seen in the samples of a joint's sensor [Nm],
+        NaN for none. pauses : whether the sessions follow one another by their clock, with pauses.
     """
 
     sessions: int
@@ -185,6 +186,7 @@ class Setting:
     standstill_rad_s: float = 0.01
     compared: bool = False
     compliance: Floats | None = None
+    twist: Floats | None = None
     clipped: Floats | None = None
     pauses: bool = False
 

@@ -45,6 +45,8 @@ class ArmMotion:
     gear_ratio : (n,) motor turns for a turn of the joint. inertia : (n,) of the drives.
     link_coulomb, motor_coulomb : (n,) Coulomb friction of link and drive [Nm].
     friction : the model's drive friction (N, n) [Nm] as a function of the motors' speed (N, n).
+    motor_q : (N, n) positions of the motors referred to the joints [rad], where they are the published ones and q those
+        of the links behind springs; None: q.
     slip : (N, n) Coulomb friction of the drives over its level: from one sign to the other within the presliding
         length after a reversal; None: at once.
     springs : between published motors and the links; None if the links' positions are published, or the stiffness
@@ -72,6 +74,7 @@ class ArmMotion:
     link_coulomb: Floats
     motor_coulomb: Floats
     friction: Callable[[Floats], Floats] = field(default=np.zeros_like)
+    motor_q: Floats | None = None
     slip: Floats | None = None
     springs: Springs | None = None
     loaded: bool = True
@@ -91,11 +94,19 @@ class ArmMotion:
         time = self.time if self.whole is None else self.whole.time
         return float(time[1] - time[0]) if len(time) > 1 else 1e-3
 
+    def motor_angle(self, joint: int, compliance: float) -> Floats:
+        """Position (N,) of a motor referred to its joint: the published one, or that of the link and the twist of the
+        joint of a compliance [rad/Nm]."""
+        published = (self.q if self.motor_q is None else self.motor_q)[:, joint]
+        return published + compliance * self.joint_torque[:, joint] if compliance else published
+
     def part(self, picked: Picked) -> ArmMotion:
         """Some samples of this motion. Operators with memory go along the whole one: see `along`."""
         found = {name: getattr(self, name)[picked] for name in _BY_SAMPLE}
-        slip = None if self.slip is None else self.slip[picked]
-        return replace(self, **found, slip=slip, whole=self, picked=picked)
+        for name in ("motor_q", "slip"):
+            values = getattr(self, name)
+            found[name] = None if values is None else values[picked]
+        return replace(self, **found, whole=self, picked=picked)
 
     def along(self, made: Callable[[ArmMotion], Floats], *key: Hashable) -> Floats:
         """Values (N, ...) of an operator with memory: made on the whole motion, picked for a part.

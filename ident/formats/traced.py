@@ -97,6 +97,10 @@ class TracedMotion:
     def __getattr__(self, name: str) -> Any:
         raise NeedsMore(name)
 
+    def motor_angle(self, joint: int, compliance: float) -> Traced:
+        """Position of a motor, as of `ArmMotion`."""
+        return self.q[:, joint] + compliance * self.joint_torque[:, joint]
+
     def torque_of(self, bodies: NDArray[np.float64]) -> Traced:
         """Rigid torque of other bodies (n, 10)."""
         return self._row(self._rigid(bodies, self._q, self._qd, self._qdd))

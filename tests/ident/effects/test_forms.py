@@ -74,6 +74,17 @@ def test_a_late_ripple_is_that_of_the_angle_before() -> None:
     assert np.max(np.abs(late - now)) > 0.3
 
 
+def test_a_ripple_turns_with_the_motor_ahead_of_its_link() -> None:
+    ripple, links = EFFECTS["gear_ripple"], motion()
+    values = {"cosine": 0.3, "sine": -0.2, "cycles_per_turn": 2.0, "gear_ratio": 100.0}
+    motors = replace(links, motor_q=links.q + 1e-3 * links.joint_torque)
+    of_motors = ripple.torque(motors, 1, values)[0]
+    np.testing.assert_allclose(ripple.torque(links, 1, {**values, "compliance": 1e-3})[0], of_motors)
+    assert np.max(np.abs(of_motors - ripple.torque(links, 1, values)[0])) > 0.1
+    some = motors.part(slice(100, 200))
+    np.testing.assert_array_equal(ripple.torque(some, 1, values)[0], of_motors[100:200])
+
+
 def test_a_hose_over_two_joints_has_a_potential() -> None:
     """Its pulls are the slopes of half the stiffness times the squared length."""
     hose, here = EFFECTS["cable_spring"], motion()

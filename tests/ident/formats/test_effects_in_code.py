@@ -32,7 +32,7 @@ CARRIED = [
     entry("friction_position", 2, form="wave", cosine=0.4, sine=0.2, cycles_per_turn=2.0),
     entry("friction_position", 2, form="spot", cosine=0.4, centre=0.2, half_width=0.5),
     entry("presliding_hysteresis", 2, form="smooth in speed", amplitude=1.0, velocity=0.05),
-    entry("gear_ripple", 2, cosine=0.4, sine=0.2, cycles_per_turn=2.0, gear_ratio=100.0),
+    entry("gear_ripple", 2, cosine=0.4, sine=0.2, cycles_per_turn=2.0, gear_ratio=100.0, compliance=1e-4),
     entry("motor_torque_gain", 2, error=0.1),
     entry("motor_torque_gain", 2, form="saturating", error=0.1, cubic=0.001),
     entry("cable_spring", 4, form="hardening", stiffness=1.0, quadratic=0.2, cubic=0.3),
