@@ -21,6 +21,7 @@ from lwr_driver.configuration import find
 from lwr_driver.places import Place
 from lwr_driver.references import Frozen, Reference, UsedFile, freeze, noting, sha256, used
 from lwr_driver.session import read_session
+from runner.contact import expected_arm
 from runner.experiment import ExperimentProgress
 from runner.experiment_file import Experiment
 from runner.planning import read_plan
@@ -51,6 +52,7 @@ def gather(experiment: Experiment, rounds: int = 0) -> list[Reference]:
         for plan in (experiment.excitation.plan, experiment.excitation.validation_plan):
             if plan is not None:
                 read_plan(find(plan, beside=beside), arm)
+        expected_arm(experiment.contact, arm, beside)
         if experiment.diagnosis.reference is not None:
             read_model(find(experiment.diagnosis.reference, beside=beside))
         _examine_problem(experiment, needed=max(rounds, experiment.replan.rounds) > 0)

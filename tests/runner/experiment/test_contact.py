@@ -17,6 +17,7 @@ from lwr_driver.contact import ContactWatch
 from lwr_driver.session import read_session
 from runner.contact import ContactPlan, expected_arm
 from runner.experiment_file import Experiment
+from runner.files import begin, gather
 from sim_backend.robot import truth
 from tests.lwr_driver.test_contact import follow, swing
 from tests.runner.experiment.experiment_rig import experiment_file, run
@@ -40,6 +41,17 @@ def test_an_experiment_file_lowers_the_limits_and_raises_none(tmp_path: Path) ->
         ConfigurationError, match=r"short\.yaml:\d+: `contact`: external_nm of joint 7 is 4\.0 Nm.*lowered"
     ):
         Experiment.load(file)
+
+
+def test_the_model_of_the_watch_is_frozen_with_the_experiment(tmp_path: Path) -> None:
+    write_model(true_model(), tmp_path / "model.yaml")
+    experiment = Experiment.load(experiment_file(tmp_path, contact={"model": "model.yaml"}))
+    (tmp_path / "results").mkdir()
+    frozen = begin(experiment, gather(experiment), tmp_path / "results")
+    (tmp_path / "model.yaml").unlink()
+    assert expected_arm(frozen.contact, Arm.load(), frozen.folder).coulomb[1] == pytest.approx(0.41)
+    with pytest.raises(ConfigurationError, match=r"'model\.yaml' not found"):
+        gather(experiment)
 
 
 def test_an_identified_model_expects_more_than_the_nominal_arm(tmp_path: Path) -> None:
