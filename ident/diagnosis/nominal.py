@@ -2,7 +2,7 @@
 
 Each side keeps its own sample times. Joint torque and its regressor are averaged over short bins. A slower motor
 torque gives one row per sample, with the regressor at the same instant. Both operations are linear and act on torque
-and regressor alike, so neither adds a bias. A row depends on a few milliseconds only, so standstill and reversals
+and regressor alike, so neither adds a bias. A row depends on the samples of its bin only, so standstill and reversals
 spoil few rows.
 
 The drive's own columns (Ia, Fvm, Fcm) belong to the motor, apart from the link by the twist of the joint. The twist

@@ -164,7 +164,7 @@ class EstimatorComparison:
         )
 
     def choice(self, tilted: Sequence[bool]) -> Choice:
-        """All candidates, and the preferred one within a standard error of the best."""
+        """All candidates, and the preferred one."""
         bodies = self.bodies is not None
         unseen = ", ".join(self.unseen[:8]) + (
             f" and {len(self.unseen) - 8} more" if len(self.unseen) > 8 else ""

@@ -1,7 +1,7 @@
 """Rows at the full band of a channel: means over short bins of neighbouring samples.
 
-A mean acts on torque and regressor alike, so it adds no bias. A row depends on a few milliseconds only: a reversal
-or a lost sample spoils few rows.
+A mean acts on torque and regressor alike, so it adds no bias. A row depends on the samples of its bin only: a
+reversal or a lost sample spoils few rows.
 """
 
 from __future__ import annotations

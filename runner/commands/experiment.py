@@ -87,8 +87,8 @@ def command(
     again, estimates the model, and diagnoses its errors. Ends with the verdict, its numbers, and the command that
     opens the report; report.txt and --verbose have the tables.
 
-    Without FILE it takes the experiment.yaml of `lwr-run init` in this folder, if that is on the emulator, else the
-    default experiment. A real arm is moved by a FILE that you name alone.
+    Without FILE it takes the experiment.yaml of `lwr-run init` in this folder, else the default experiment. A real arm
+    is moved by a FILE that you name alone.
 
     Ctrl-C once stops the arm within its limits, twice drops the link.
 
