@@ -65,7 +65,7 @@ class Plan:
 
     def forget_references(self) -> None:
         """Delete the references, and what healthy twins showed by them."""
-        for pattern in ("reference_*.yaml", "*/clean_error_*.json"):
+        for pattern in ("reference_*.yaml", "*/clean_rows_*.json"):
             for path in self.out.glob(f"sessions*/{pattern}"):
                 path.unlink()
 
@@ -166,11 +166,11 @@ def _one(plan: Plan, seed: int, kind: str, cause: str | None, encoder: Encoder) 
 def _twin_errors(store: Store, healthy: Case, reference: Path | None) -> np.ndarray:
     """Held-out errors of the base model in the diagnosis of the healthy twin, made once."""
     folder = store.folder / healthy.name
-    kept = folder / f"clean_error_{'with' if reference else 'without'}.json"
+    kept = folder / f"clean_rows_{'with' if reference else 'without'}.json"
     if kept.is_file():
         return np.array(json.loads(kept.read_text()))
     diagnosis, _ = diagnosed(store.sessions(healthy), reference)
-    errors = error_rows(diagnosis["gain"]["test_rms_base"])
+    errors = error_rows(diagnosis["gain"]["rows_base"])
     kept.write_text(json.dumps(errors.tolist()))
     return errors
 

@@ -145,11 +145,12 @@ def _beyond(diagnosis: Mapping[str, Any], twin: Mapping[str, Any]) -> set[int]:
 
 
 def _efficiency(diagnosis: Mapping[str, Any], twin: Mapping[str, Any]) -> float | None:
-    """Of the held-out rows where the base model is worse than the twin's by 3 %; None if there is none."""
-    gain, healthy = diagnosis["gain"], twin["gain"]["test_rms_base"]
+    """Of the held-out rows of the diagnosis where the base model is worse than the twin's by 3 %; None if there is
+    none."""
+    gain, healthy = diagnosis["gain"], twin["gain"]["rows_base"]
     removed = brought = 0.0
     for side in ("motor", "joint"):
-        rows = (gain["test_rms_base"].get(side), gain["test_rms_extended"].get(side), healthy.get(side))
+        rows = (gain["rows_base"].get(side), gain["rows_extended"].get(side), healthy.get(side))
         for base, extended, without in zip(*(row or () for row in rows), strict=False):
             if None not in (base, extended, without) and base > _AFFECTED * without:
                 removed, brought = removed + base - extended, brought + base - without

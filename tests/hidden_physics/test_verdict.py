@@ -36,8 +36,8 @@ def diagnosis(*findings, unexplained=(), base=(1.0,) * 14, extended=(1.0,) * 14)
             {"side": "motor", "joint": joint, "depends_on": list(names)} for joint, names in unexplained
         ],
         "gain": {
-            "test_rms_base": {"motor": list(base[:7]), "joint": list(base[7:])},
-            "test_rms_extended": {"motor": list(extended[:7]), "joint": list(extended[7:])},
+            "rows_base": {"motor": list(base[:7]), "joint": list(base[7:])},
+            "rows_extended": {"motor": list(extended[:7]), "joint": list(extended[7:])},
         },
     }
 

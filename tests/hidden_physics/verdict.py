@@ -36,7 +36,8 @@ class Verdict:
     flagged : for effects outside the catalogue: something is unexplained there and nothing is sure
     depends : share of the variables of such an effect that the diagnosis states
     deviations : by `cause.parameter`, error in standard deviations
-    efficiency : error removed over error that the true model removes, on the affected rows; NaN unknown
+    efficiency : error removed over error that the true model removes, in the rows of the diagnosis of the affected
+    joints, without the reversals and the rest that no model predicts; NaN unknown
     """
 
     named: tuple[bool, ...]
@@ -175,7 +176,7 @@ def error_rows(errors: Mapping[str, Any]) -> NDArray[np.float64]:
 
 def _efficiency(diagnosis: Mapping[str, Any], twin: NDArray[np.float64]) -> float:
     gain = diagnosis["gain"]
-    base, extended = error_rows(gain["test_rms_base"]), error_rows(gain["test_rms_extended"])
+    base, extended = error_rows(gain["rows_base"]), error_rows(gain["rows_extended"])
     affected = base > _AFFECTED * twin
     if not affected.any():
         return float("nan")

@@ -37,7 +37,13 @@ def truth(cause: str = "stribeck", joint: int = 2, listed: bool = True) -> dict[
 
 
 def said(*findings: dict[str, Any], **more: Any) -> dict[str, Any]:
-    gain = {"test_rms_base": {"motor": [1.0, 1.5]}, "test_rms_extended": {"motor": [1.0, 1.1]}}
+    before, after = {"motor": [1.0, 1.5]}, {"motor": [1.0, 1.1]}
+    gain = {
+        "rows_base": before,
+        "rows_extended": after,
+        "test_rms_base": before,
+        "test_rms_extended": after,
+    }
     return {"findings": list(findings), "unexplained": [], "gain": gain, **more}
 
 
@@ -84,7 +90,7 @@ def test_what_the_healthy_twin_has_too_is_not_flagged() -> None:
 
 
 def test_the_gain_is_held_against_what_the_fault_brought() -> None:
-    healthy = {"test_rms_base": {"motor": [1.0, 1.0]}, "test_rms_extended": {"motor": [1.0, 1.0]}}
+    healthy = {"rows_base": {"motor": [1.0, 1.0]}, "rows_extended": {"motor": [1.0, 1.0]}}
     verdict = judge(said(finding("stribeck", 2, 0.95)), truth(), said(gain=healthy))
     assert verdict["efficiency"] == pytest.approx(0.8)
     assert verdict["worse"] == []
