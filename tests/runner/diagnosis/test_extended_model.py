@@ -128,10 +128,10 @@ def test_a_model_of_another_arm_is_refused(tmp_path: Path) -> None:
 
 
 def test_computed_torque_has_the_effects(healthy: DynamicModel) -> None:
-    extended = replace(healthy, effects=(HOSE, FILM))
+    bare, extended = (replace(healthy, effects=effects) for effects in ((), (HOSE, FILM)))
     q, qd, qdd = np.random.default_rng(2).normal(size=(3, 50, 7)) * 0.3
     change = {
-        side: extended.torque(q, qd, qdd, side=side) - healthy.torque(q, qd, qdd, side=side)
+        side: extended.torque(q, qd, qdd, side=side) - bare.torque(q, qd, qdd, side=side)
         for side in ("motor", "joint")
     }
     film = 1.5 * np.sign(qd[:, 1]) * np.exp(-np.abs(qd[:, 1]) / 0.05)
