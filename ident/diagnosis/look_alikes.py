@@ -279,7 +279,10 @@ def _traces(bench: DiagnosisBench, first: Signature, second: Signature) -> tuple
             for name in ("q", "motor_speed", "joint_torque")
         ]
         used = np.isfinite(first.left[side][:, joint])
-        turns = states[0] * nominal.arm.gear_ratio[own] / (2.0 * np.pi)
+        twist = bench.dictionary.setting.twist
+        ahead = 0.0 if twist is None else float(twist[own])
+        motors = nominal.reduce(side, [m.motor_angle(own, ahead) for m in nominal.motions])
+        turns = motors * nominal.arm.gear_ratio[own] / (2.0 * np.pi)
         columns = (
             first.time[side],
             first.session[side],
