@@ -81,7 +81,7 @@ def test_without_test_sessions_the_gain_is_that_of_the_rows(
 
 def test_each_joint_is_measured_by_its_own_error() -> None:
     def errors(sides: list[float], *joints: float) -> TorqueErrors:
-        return TorqueErrors(np.array(sides), np.array(joints))
+        return TorqueErrors(np.array(sides), np.array(joints), np.array(joints))
 
     before = errors([0.2], 2.0, 0.05)
     assert errors([0.2002], 2.002, 0.03).left_of(before) < 1.0
@@ -89,6 +89,16 @@ def test_each_joint_is_measured_by_its_own_error() -> None:
     assert errors([0.203], 2.03, 0.03).left_of(before) == np.inf
     assert errors([0.2], 2.0).left_of(before) == np.inf
     assert errors([]).left_of(errors([])) == 1.0
+
+
+def test_reversals_are_no_reason_against_what_predicts_the_motion() -> None:
+    def errors(*joints: float, moving: float) -> TorqueErrors:
+        return TorqueErrors(np.ones(1), np.array(joints), np.array([joints[0], moving]))
+
+    before = errors(1.0, 0.92, moving=0.54)
+    assert errors(1.0, 0.925, moving=0.46).left_of(before) == 1.0
+    assert errors(1.0, 0.925, moving=0.539).left_of(before) > 1.0
+    assert errors(1.0, 0.935, moving=0.46).left_of(before) > 1.0
 
 
 @pytest.mark.parametrize("harmful", [2, 3])
@@ -100,7 +110,7 @@ def test_an_effect_that_raises_the_torque_error_is_not_in_the_extension(
     def measured(model: DynamicModel, sessions: Sequence[Session]) -> TorqueErrors:
         joints = [entry["joints"] for entry in model.effects]
         error = np.array([1.0 + 2.0 * ([harmful] in joints) - 0.5 * (len(joints) > 0)])
-        return TorqueErrors(error, error)
+        return TorqueErrors(error, error, error)
 
     monkeypatch.setattr(TorqueErrors, "of", measured)
     told = found(logs, chain)
@@ -126,7 +136,7 @@ def test_where_no_extension_predicts_better_nothing_says_that_there_is_one(
 ) -> None:
     def measured(model: DynamicModel, sessions: Sequence[Session]) -> TorqueErrors:
         error = np.array([1.0 + (len(model.effects) > 0) * (1.0 if harmful else -0.5)])
-        return TorqueErrors(error, error)
+        return TorqueErrors(error, error, error)
 
     # As with the drawing of an arm, so that `identify` makes the models.
     monkeypatch.setattr(Evidence, "drawn", property(lambda self: True))
