@@ -182,8 +182,8 @@ def main(
     path = out / "sensitivity.jsonl"
     done = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
     if not report:
-        known_cases = [r for r in read_results(out / "results.jsonl") if "crash" not in r]
-        chosen = [r for r in known_cases if r["truth"]["seed"] in seeds] if seeds else known_cases[:cases]
+        results = [r for r in read_results(out / "results.jsonl") if "crash" not in r]
+        chosen = [r for r in results if r["truth"]["seed"] in seeds] if seeds else results[:cases]
         known = {(one["number"], one["factor"]) for one in done}
         wanted = [(n, f) for n in numbers() for f in FACTORS if only in str(n) and (str(n), f) not in known]
         work = Parallel(n_jobs=jobs, return_as="generator_unordered")

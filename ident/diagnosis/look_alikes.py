@@ -279,8 +279,7 @@ def _traces(bench: DiagnosisBench, first: Signature, second: Signature) -> tuple
             for name in ("q", "motor_speed", "joint_torque")
         ]
         used = np.isfinite(first.left[side][:, joint])
-        twist = bench.dictionary.setting.twist
-        ahead = 0.0 if twist is None else float(twist[own])
+        ahead = bench.dictionary.setting.motor_ahead(own)
         motors = nominal.reduce(side, [m.motor_angle(own, ahead) for m in nominal.motions])
         turns = motors * nominal.arm.gear_ratio[own] / (2.0 * np.pi)
         columns = (

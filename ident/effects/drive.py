@@ -496,7 +496,7 @@ class GearRipple(Effect):
         ratio = float(setting.gear_ratio[joint])
         if ratio <= 1.0:
             return []
-        twist = 0.0 if setting.twist is None else float(setting.twist[joint])
+        twist = setting.motor_ahead(joint)
         elastic = {"compliance": twist} if twist > 0.0 else {}
         plain = [Shape(cycles_per_turn=k, gear_ratio=ratio).at(**elastic) for k in (1.0, 2.0)]
         delayed = product(plain, _RIPPLE_DELAYS)

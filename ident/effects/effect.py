@@ -190,6 +190,10 @@ class Setting:
     clipped: Floats | None = None
     pauses: bool = False
 
+    def motor_ahead(self, joint: int) -> float:
+        """Twist [rad/Nm] of a motor (from 0) ahead of its published link, 0 where the motor's position is published."""
+        return 0.0 if self.twist is None else float(self.twist[joint])
+
 
 class Plant(Protocol):
     """A simulated arm of n joints as effects see it; arrays are (n,), SI units. model : its pinocchio model."""
