@@ -182,7 +182,6 @@ def test_a_joint_late_by_itself_is_a_warning_of_the_result(caplog: pytest.LogCap
     (told,) = [text for text in found.warnings if "of the other joints; check how this" in text]
     late = re.search(r"E1 joint torque fits the motion best ([\d.]+) ± [\d.]+ ms late", told)
     assert late is not None
-    assert told not in caplog.text
     assert float(late[1]) == pytest.approx(20.0, abs=0.5)
     known = Known((Doubt("position", ("E1",), "comes late", "late positions", MEND_TIME),))
     again = identify(replace(log, joint=replace(log.joint, effort=effort)), chain(), SETTINGS, known=known)
