@@ -11,7 +11,8 @@ from fri.errors import DataError
 from ident.diagnosis.candidates import Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Floats
 from ident.diagnosis.noise import noise_floor, repeatability
-from ident.diagnosis.nominal import TRAVEL_RAD, Nominal, NominalArm, structure_of
+from ident.diagnosis.nominal import TRAVEL_RAD, Nominal, structure_of
+from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import Reference, joint_of, symbol_of
 from ident.diagnosis.selection import Selection

@@ -18,7 +18,7 @@ import numpy as np
 from ident.diagnosis.bench import DiagnosisBench, again_with, prepare_bench
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.evidence import Floats, chance
-from ident.diagnosis.nominal import NominalArm
+from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import USUAL_CHANGES
 from ident.diagnosis.selection import Claim, Selection, State

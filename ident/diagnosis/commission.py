@@ -28,7 +28,8 @@ from ident.diagnosis.broken_data import broken_channels, refuse, without_broken
 from ident.diagnosis.character import character
 from ident.diagnosis.evidence import Evidence, Floats, Rows
 from ident.diagnosis.held_out import held_out
-from ident.diagnosis.nominal import GAIN_STD, Nominal, NominalArm
+from ident.diagnosis.nominal import Nominal
+from ident.diagnosis.nominal_arm import GAIN_STD, NominalArm
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
 from ident.diagnosis.reference import (

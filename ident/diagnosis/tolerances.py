@@ -13,7 +13,7 @@ import numpy as np
 
 from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.evidence import Evidence, Rows
-from ident.diagnosis.nominal import NominalArm
+from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.reference import USUAL_CHANGES
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import (

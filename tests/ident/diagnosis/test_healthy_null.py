@@ -19,7 +19,7 @@ from ident.diagnosis.commission import (
     with_far_presliding,
 )
 from ident.diagnosis.evidence import Score
-from ident.diagnosis.nominal import GAIN_STD, NominalArm
+from ident.diagnosis.nominal_arm import GAIN_STD, NominalArm
 from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.diagnosis.selection import State
 from ident.diagnosis.settings import DiagnosisSettings

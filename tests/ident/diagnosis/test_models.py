@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ident.diagnosis.models import lasting, turning_friction
-from ident.diagnosis.nominal import NominalArm
+from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.selection import Selection
 from ident.effects import PRESLIDING, entry_of
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.diagnosis.nominal import NominalArm
+from ident.diagnosis.nominal_arm import NominalArm
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, Setting
 

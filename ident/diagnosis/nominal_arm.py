@@ -1,0 +1,103 @@
+"""What is known of an arm before its sessions are looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import Coupling
+from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of
+from ident.effects.motion import dahl
+
+Floats = NDArray[np.float64]
+
+GAIN_STD = SENSOR_GAIN.usual_change
+"""Usual standard deviation of a torque sensor's gain from day to day."""
+
+
+@dataclass(frozen=True, eq=False)
+class NominalArm:
+    """Prior knowledge of the arm.
+
+    compliance : (n,) twist of the joints per torque [rad/Nm], zero where unknown. gear_ratio : (n,), one where
+    unknown. motor_delay_s, joint_delay_s : of the healthy channels.
+    encoder : `link` or `motor`, the side of the elastic joints with the published positions; encoder_known : whether
+    it comes from a healthy arm.
+    presliding : (n,) distance after a reversal in which 63 % of the drive's Coulomb friction turn [rad], zero where
+    unknown.
+    far, far_share : (n,) longer distance [rad] for a share of that friction, and the share.
+    gain_std : of the torque sensors' gains from day to day. stated : (n,) compliance of the arm's description
+    [rad/Nm], `compliance` by default. compliance_std : (n,) standard error of that of a healthy arm.
+    couplings : pairs of joints with coupled drives. healthy : entries of the healthy arm's own effects
+    (`ident.effects`); their torque is part of the nominal one, so that a cause is a change against this arm.
+    """
+
+    chain: Chain
+    compliance: Floats
+    gear_ratio: Floats
+    motor_delay_s: float = 0.0
+    joint_delay_s: float = 0.0
+    encoder: Literal["link", "motor"] = "link"
+    encoder_known: bool = False
+    presliding: Floats | None = None
+    far: Floats | None = None
+    far_share: Floats | None = None
+    gain_std: float = GAIN_STD
+    couplings: tuple[Coupling, ...] = ()
+    healthy: tuple[Mapping[str, Any], ...] = ()
+    stated: Floats | None = None
+    compliance_std: Floats | None = None
+
+    @property
+    def anchor(self) -> Floats:
+        """Compliance (n,) [rad/Nm] around which a fit stays."""
+        return self.compliance if self.stated is None else self.stated
+
+    @property
+    def delays(self) -> dict[str, float]:
+        """Delays of the channels [s], as in the signal settings of a model."""
+        return {"motor_delay_s": self.motor_delay_s, "joint_delay_s": self.joint_delay_s}
+
+    @property
+    def usual_length(self) -> float:
+        """Presliding length [rad] of a drive of this arm where its own is unknown: the geometric mean of the others, 0
+        without any."""
+        known = np.zeros(0) if self.presliding is None else self.presliding[self.presliding > 0.0]
+        return float(np.exp(np.mean(np.log(known)))) if len(known) else 0.0
+
+    def turning(self, level: Floats, longer: Floats | float = 1.0) -> list[dict[str, Any]]:
+        """Entries of a model for Coulomb friction (n,) [Nm] that turns over the arm's lengths, `longer` times the near
+        ones (n,)."""
+        if self.presliding is None:
+            return []
+        near = self.presliding * longer
+        entries = []
+        for joint in np.flatnonzero(self.presliding > 0.0).tolist():
+            far = 0.0 if self.far_share is None else float(self.far_share[joint])
+            parts = [(level[joint] * (1.0 - far), near[joint])]
+            if far and self.far is not None:
+                parts.append((level[joint] * far, self.far[joint]))
+            entries += [
+                entry_of(PRESLIDING, [joint + 1], {"amplitude": (amplitude, 0.0), "length": (length, 0.0)})
+                for amplitude, length in parts
+            ]
+        return entries
+
+    def slip(self, speed: Floats, dt: float) -> Floats:
+        """Coulomb friction of the drives over its level for motor speeds (N, n) [rad/s]: Dahl's state, or the sum of
+        two of them (Maxwell slip: asperities of several lengths side by side)."""
+        found = np.sign(speed)
+        if self.presliding is not None:
+            for joint in np.flatnonzero(self.presliding > 0.0):
+                along = np.cumsum(speed[:, joint]) * dt
+                start = float(found[0, joint])
+                found[:, joint] = dahl(along, float(self.presliding[joint]), start)
+                if self.far is not None and self.far_share is not None and self.far_share[joint] != 0.0:
+                    slow = dahl(along, float(self.far[joint]), start)
+                    found[:, joint] += float(self.far_share[joint]) * (slow - found[:, joint])
+        return found
