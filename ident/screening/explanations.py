@@ -15,9 +15,10 @@ import numpy as np
 
 from ident.dynamics.parameters import Floats
 from ident.screening.nominal import nominal
+from ident.screening.normal_equations import Class, Fit, Normal, Part
 from ident.screening.parts import DEVIATIONS, GAIN, LEFT, PartError, part_errors, scopes
 from ident.screening.positions import session_offsets
-from ident.screening.redundancy import Class, Fit, Gain, Normal, Part, Redundancy
+from ident.screening.redundancy import Gain, Redundancy
 
 # Ratios of units often mixed up, with their names.
 UNITS = {

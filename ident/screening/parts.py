@@ -14,7 +14,8 @@ from typing import Literal
 import numpy as np
 
 from ident.dynamics.parameters import Floats
-from ident.screening.redundancy import Class, Fit, Normal, Part, Redundancy, SampledRows, Size, solve
+from ident.screening.normal_equations import Class, Fit, Normal, Part, solve
+from ident.screening.redundancy import Redundancy, SampledRows, Size
 
 GAIN, DEVIATIONS = 0.18, 5.0
 """Least error of a gain of interest, and in its standard deviations: sensors are calibrated to a few per cent."""

@@ -16,8 +16,9 @@ from scipy.linalg import null_space
 
 from ident.dynamics.parameters import Floats
 from ident.screening.doubts import LATE_S
+from ident.screening.normal_equations import Fit, Normal, Part
 from ident.screening.parts import sessions_of
-from ident.screening.redundancy import Fit, Normal, Part, Redundancy, SampledRows
+from ident.screening.redundancy import Redundancy, SampledRows
 
 _DEVIATIONS = 6.0
 _STEP = 1e-3

@@ -25,39 +25,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrs, dpstrf
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, LINK_FRICTION, Floats
 from ident.dynamics.regressor import rigid_regressor, torque
 from ident.dynamics.structure import Coupling
-from ident.estimators.prior import Prior
 from ident.rows.content import Recall
 from ident.rows.filters import ParallelFilter, SignalSettings, block_means, thinning
 from ident.rows.prepare import prepare
 from ident.rows.prepared import TorqueChannel
 from ident.rows.sessions import payload_name
 from ident.screening.nominal import nominal
+from ident.screening.normal_equations import BLOCK, ROUNDS, Class, Fit, Normal, Part, Sums, reweighted, solve
 from lwr_driver.session import Session
-
-Class = tuple[str, int]
-Part = tuple[int, int]
 
 _BODY = len(INERTIAL)
 # Friction of the joint side; drive inertia, friction and offset of the motor side.
 _JOINT, _MOTOR = 3, 4
-# A residual below this share of the torque is as good as none: the accuracy of torque sensors.
-FLOOR = 0.01
-# Rounds of reweighting, and fall of the score in one that ends them.
-_ROUNDS, _SETTLED = 8, 1e-3
-# Square of the sine between a column and those before it, below which it is dependent.
-_DEPENDENT = 1e-9
-# Norm of a column over the largest, below which it is nothing but rounding.
-_NOTHING = 1e-10
 # Relative standard deviation of bodies that are the URDF's in the order of magnitude.
 _ORDER = 2.0
-# Rows with a common error: two seconds at the usual rate.
-_BLOCK = 10
 _MOST_ROWS = 800
 _COVERED = 0.9
 # Share of rest in a row of a joint at rest, and of its moving rows, below which the others count, too.
@@ -189,58 +175,6 @@ def _rows(
     return SampledRows(
         channel.side, record, payload, at[kept], q, qd, qdd, jerk, sign, turn, coupled, smooth, slope, moving
     )
-
-
-@dataclass(frozen=True)
-class Normal:
-    """Normal equations of the m classes, the torques' of the o parts.
-
-    matrix : G (m, p, p). mixed : B^T (m, o, n + 2, p). scatter, square : T (m, o, n + 2, n + 2) without the mean of the
-    session, and S with it. prior : of the bodies, by the URDF's.
-    """
-
-    classes: tuple[Class, ...]
-    parts: tuple[Part, ...]
-    matrix: Floats
-    mixed: Floats
-    scatter: Floats
-    square: Floats
-    prior: Prior
-
-    def total(self, fit: Fit) -> Floats:
-        """Weighted sum of the matrices and the prior's precision, (p, p)."""
-        weights = [fit.weight[key] for key in self.classes]
-        return np.tensordot(weights, self.matrix, 1) + fit.nominal * self.prior.precision
-
-    @property
-    def by_data(self) -> Normal:
-        """The same without the prior, for what the data alone have to tell: a wrong URDF bends what they hardly do."""
-        width = self.matrix.shape[-1]
-        return replace(self, prior=Prior(np.zeros(width), np.zeros((width, width))))
-
-    @property
-    def rows(self) -> float:
-        """Independent rows of a class, in the mean."""
-        return max(float(self.square[:, :, -2, -2].sum()) / (len(self.classes) * _BLOCK), 1.0)
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Parameters (p,), rho and weight of each class, and weight `nominal` of the prior.
-
-    cost : what the fit minimises. `score`: sum of log rho, none below the floor.
-    """
-
-    parameters: Floats
-    rho: Mapping[Class, float]
-    weight: Mapping[Class, float]
-    nominal: float
-    cost: float
-
-    @property
-    def score(self) -> float:
-        """Sum over classes of log rho; the less, the better the explanation."""
-        return float(sum(np.log(max(value, FLOOR)) for value in self.rho.values()))
 
 
 @dataclass(frozen=True)
@@ -442,7 +376,7 @@ class Redundancy:
         """Torque (K, n) with the changes of the channel undone."""
         return np.asarray(_extended(rows) @ self.map_of(rows.side, rows.part)[: self.chain.n].T)
 
-    def fit(self, normal: Normal | None = None, *, doubtful: bool = True, rounds: int = _ROUNDS) -> Fit:
+    def fit(self, normal: Normal | None = None, *, doubtful: bool = True, rounds: int = ROUNDS) -> Fit:
         """Weighted least squares, each class and the prior weighted by its own residual.
 
         The cost is the sum of log rho, and log(1 + d / N) / 2 for the squared distance d from the prior and N
@@ -462,8 +396,8 @@ class Redundancy:
         # A torque in a wrong unit is far too heavy or far too light in one of these starts, or the URDF is.
         starts = (total, 1.0 / normal.rows), (common, 1.0 / normal.rows), (total, 0.0)
         most = (3 if normal.prior.precision.any() else 2) if doubtful else 1
-        sums = _Sums(mixed, square, total)
-        fits = [_reweighted(normal, sums, *start, rounds) for start in starts[:most]]
+        sums = Sums(mixed, square, total)
+        fits = [reweighted(normal, sums, *start, rounds) for start in starts[:most]]
         return min(fits, key=lambda fit: fit.cost)
 
     def _maps(self, normal: Normal) -> Floats:
@@ -534,7 +468,7 @@ class Redundancy:
             for column, rest, weight, left in parts:
                 error = left - size * rest
                 product = weight * rest * error
-                blocks = np.add.reduceat(product, np.arange(0, product.shape[1], _BLOCK), axis=1)
+                blocks = np.add.reduceat(product, np.arange(0, product.shape[1], BLOCK), axis=1)
                 together += float(np.sum(blocks.sum(axis=0) ** 2))
                 apart += float(np.sum(blocks**2))
                 acting = weight * (column != 0.0)
@@ -570,49 +504,9 @@ class Redundancy:
                 if weight.any():
                     error = true - own @ fit.parameters
                     product = (own @ spreads) * (weight * error)[:, None]
-                    blocks = np.add.reduceat(product, np.arange(0, len(product), _BLOCK), axis=0)
+                    blocks = np.add.reduceat(product, np.arange(0, len(product), BLOCK), axis=0)
                     variance += np.sum(blocks**2, axis=0)
         return np.sqrt(variance)
-
-
-class _Sums(NamedTuple):
-    """W^T y (m, p) of the classes, y^T y (m,), and the same (m,) about the mean."""
-
-    mixed: Floats
-    square: Floats
-    total: Floats
-
-
-def _reweighted(normal: Normal, sums: _Sums, start: Floats, nominal_weight: float, rounds: int) -> Fit:
-    """The fit by reweighting. start : squared residuals (m,) of the first weights. nominal_weight : first one."""
-    mixed, square, total = sums
-    least = FLOOR**2 * total
-    count, width, _ = normal.matrix.shape
-    flat, prior = normal.matrix.reshape(count * width, width), normal.prior
-    pull = prior.precision @ prior.mean
-    weight, firm, error, values, cost = 1.0 / start, nominal_weight, total, np.zeros(0), np.inf
-    for _ in range(rounds):
-        left = (weight @ flat.reshape(count, -1)).reshape(width, width) + firm * prior.precision
-        values = solve(left, weight @ mixed + firm * pull)
-        fitted = (flat @ values).reshape(count, width) @ values
-        error = np.maximum(square - 2.0 * mixed @ values + fitted, 0.0)
-        weight = 1.0 / np.maximum(error, least)
-        apart = values - prior.mean
-        distance = float(apart @ prior.precision @ apart)
-        firm = 1.0 / (normal.rows + distance)
-        # The cost falls from round to round.
-        before, residuals = cost, float(np.sum(np.log(np.maximum(error, least) / total)))
-        cost = 0.5 * (residuals + float(np.log1p(distance / normal.rows)))
-        if before - cost < _SETTLED:
-            break
-    rho = np.sqrt(error / total)
-    return Fit(
-        values,
-        dict(zip(normal.classes, rho.tolist(), strict=True)),
-        dict(zip(normal.classes, weight.tolist(), strict=True)),
-        firm,
-        cost,
-    )
 
 
 def _halves(rows: Sequence[SampledRows]) -> Iterator[SampledRows]:
@@ -662,15 +556,3 @@ def _only(values: Floats, joint: int | None) -> Floats:
     if joint is not None:
         out[joint] = values[joint]
     return out
-
-
-def solve(matrix: Floats, right: Floats) -> Floats:
-    """Solution of the normal equations in the excited columns (Cholesky with pivots), zero in the others."""
-    scale = np.sqrt(np.diag(matrix))
-    scale = np.where(scale > max(_NOTHING * np.max(scale, initial=0.0), 1e-150), scale, np.inf)
-    # Column-major as LAPACK has it; the matrix is symmetric.
-    factor, order, rank, _ = dpstrf((matrix / (scale[:, None] * scale)).T, tol=_DEPENDENT, overwrite_a=1)
-    kept = order[:rank] - 1
-    found = np.zeros(len(right))
-    found[kept] = dpotrs(factor[:rank, :rank], (right / scale)[kept])[0].ravel() / scale[kept]
-    return found

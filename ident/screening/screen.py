@@ -32,8 +32,9 @@ from ident.screening.channels import check_channels
 from ident.screening.doubts import MEND_TIME, Doubt, settle
 from ident.screening.explanations import AGREES, Explanation, explain, unit_of
 from ident.screening.limits import check_limits
+from ident.screening.normal_equations import FLOOR, Class, Fit, Normal, Part
 from ident.screening.positions import KINDS, leaning, position_errors
-from ident.screening.redundancy import FLOOR, Class, Fit, Normal, Part, Redundancy
+from ident.screening.redundancy import Redundancy
 from ident.screening.stuck import dead
 from ident.screening.zeros import zero_by_gravity
 from lwr_driver.session import Session, Sessions, as_sessions

@@ -1,0 +1,133 @@
+"""The normal equations of each class of rows, and their fit with weights by the residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg.lapack import dpotrs, dpstrf
+
+from ident.dynamics.parameters import Floats
+from ident.estimators.prior import Prior
+
+Class = tuple[str, int]
+Part = tuple[int, int]
+
+FLOOR = 0.01
+"""A residual below this share of the torque is as good as none: the accuracy of torque sensors."""
+ROUNDS = 8
+"""Rounds of reweighting, at most."""
+BLOCK = 10
+"""Rows with a common error: two seconds at the usual rate."""
+# Fall of the score in a round that ends them.
+_SETTLED = 1e-3
+# Square of the sine between a column and those before it, below which it is dependent.
+_DEPENDENT = 1e-9
+# Norm of a column over the largest, below which it is nothing but rounding.
+_NOTHING = 1e-10
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations of the m classes, the torques' of the o parts.
+
+    matrix : G (m, p, p). mixed : B^T (m, o, n + 2, p). scatter, square : T (m, o, n + 2, n + 2) without the mean of the
+    session, and S with it. prior : of the bodies, by the URDF's.
+    """
+
+    classes: tuple[Class, ...]
+    parts: tuple[Part, ...]
+    matrix: Floats
+    mixed: Floats
+    scatter: Floats
+    square: Floats
+    prior: Prior
+
+    def total(self, fit: Fit) -> Floats:
+        """Weighted sum of the matrices and the prior's precision, (p, p)."""
+        weights = [fit.weight[key] for key in self.classes]
+        return np.tensordot(weights, self.matrix, 1) + fit.nominal * self.prior.precision
+
+    @property
+    def by_data(self) -> Normal:
+        """The same without the prior, for what the data alone have to tell: a wrong URDF bends what they hardly do."""
+        width = self.matrix.shape[-1]
+        return replace(self, prior=Prior(np.zeros(width), np.zeros((width, width))))
+
+    @property
+    def rows(self) -> float:
+        """Independent rows of a class, in the mean."""
+        return max(float(self.square[:, :, -2, -2].sum()) / (len(self.classes) * BLOCK), 1.0)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters (p,), rho and weight of each class, and weight `nominal` of the prior.
+
+    cost : what the fit minimises. `score`: sum of log rho, none below the floor.
+    """
+
+    parameters: Floats
+    rho: Mapping[Class, float]
+    weight: Mapping[Class, float]
+    nominal: float
+    cost: float
+
+    @property
+    def score(self) -> float:
+        """Sum over classes of log rho; the less, the better the explanation."""
+        return float(sum(np.log(max(value, FLOOR)) for value in self.rho.values()))
+
+
+class Sums(NamedTuple):
+    """W^T y (m, p) of the classes, y^T y (m,), and the same (m,) about the mean."""
+
+    mixed: Floats
+    square: Floats
+    total: Floats
+
+
+def reweighted(normal: Normal, sums: Sums, start: Floats, nominal_weight: float, rounds: int) -> Fit:
+    """The fit by reweighting. start : squared residuals (m,) of the first weights. nominal_weight : first one."""
+    mixed, square, total = sums
+    least = FLOOR**2 * total
+    count, width, _ = normal.matrix.shape
+    flat, prior = normal.matrix.reshape(count * width, width), normal.prior
+    pull = prior.precision @ prior.mean
+    weight, firm, error, values, cost = 1.0 / start, nominal_weight, total, np.zeros(0), np.inf
+    for _ in range(rounds):
+        left = (weight @ flat.reshape(count, -1)).reshape(width, width) + firm * prior.precision
+        values = solve(left, weight @ mixed + firm * pull)
+        fitted = (flat @ values).reshape(count, width) @ values
+        error = np.maximum(square - 2.0 * mixed @ values + fitted, 0.0)
+        weight = 1.0 / np.maximum(error, least)
+        apart = values - prior.mean
+        distance = float(apart @ prior.precision @ apart)
+        firm = 1.0 / (normal.rows + distance)
+        # The cost falls from round to round.
+        before, residuals = cost, float(np.sum(np.log(np.maximum(error, least) / total)))
+        cost = 0.5 * (residuals + float(np.log1p(distance / normal.rows)))
+        if before - cost < _SETTLED:
+            break
+    rho = np.sqrt(error / total)
+    return Fit(
+        values,
+        dict(zip(normal.classes, rho.tolist(), strict=True)),
+        dict(zip(normal.classes, weight.tolist(), strict=True)),
+        firm,
+        cost,
+    )
+
+
+def solve(matrix: Floats, right: Floats) -> Floats:
+    """Solution of the normal equations in the excited columns (Cholesky with pivots), zero in the others."""
+    scale = np.sqrt(np.diag(matrix))
+    scale = np.where(scale > max(_NOTHING * np.max(scale, initial=0.0), 1e-150), scale, np.inf)
+    # Column-major as LAPACK has it; the matrix is symmetric.
+    factor, order, rank, _ = dpstrf((matrix / (scale[:, None] * scale)).T, tol=_DEPENDENT, overwrite_a=1)
+    kept = order[:rank] - 1
+    found = np.zeros(len(right))
+    found[kept] = dpotrs(factor[:rank, :rank], (right / scale)[kept])[0].ravel() / scale[kept]
+    return found
