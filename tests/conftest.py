@@ -31,11 +31,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int | None:
-    """A process or two more than processors: tests of links, processes and browsers wait much of their time."""
-    if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ:
-        return None  # the number in it
-    processors = len(os.sched_getaffinity(0))
-    return processors + min(-(-processors // 2), 2)
+    """One for each processor, threads of one core too: with more, each test takes longer and the whole no less."""
+    return len(os.sched_getaffinity(0)) if "PYTEST_XDIST_AUTO_NUM_WORKERS" not in os.environ else None
 
 
 def pytest_collection_finish() -> None:

@@ -36,6 +36,8 @@ _REPLACEABLE = 0.8
 # Largest gain of another function of the variable beside a law that is exact, as a share of its own. One bent cause is
 # ten times as likely as a scale and a second cause with this variable on the same torque; a bend this small is as rare.
 _BENT = 0.05
+# Standard deviations by which the delay in slow rows contradicts that in the others.
+_CONTRADICTED = 3.0
 # Least power of a cause in the held-out rows for a test there, over that in the rows fitted.
 _EXCITED = 0.1
 
@@ -127,10 +129,14 @@ def contradicted(finding: Finding) -> Finding:
     return replace(finding, confidence=confidence, grounds=grounds)
 
 
-def confirmed_delay(task: Task, after: State, claim: Claim, rest: tuple[float, float]) -> Finding:
+def confirmed_delay(
+    task: Task, after: State, claim: Claim, rest: tuple[float, float], slow: tuple[float, float]
+) -> Finding:
     """Finding of a late channel, see `timing_finding`, its p-value against the healthy delays of other days.
 
-    Their standard deviation comes from few days, so the probability is that of Student's distribution.
+    Their standard deviation comes from few days, so the probability is that of Student's distribution. slow : the delay
+    in slow rows and its standard deviation [s]. Springs that the model lacks turn the phase of fast motion alone: where
+    slow rows contradict the others, no row tells which is right, and the difference is part of the uncertainty.
     """
     assert after.baseline is not None
     bench, selection, seed = after.bench, after.selection, task.settings.seed
@@ -139,7 +145,12 @@ def confirmed_delay(task: Task, after: State, claim: Claim, rest: tuple[float, f
     finding = timing_finding(task, after, claim, rest, before, now)
     delay, sets = finding.parameters["delay"], 1 if task.reference is None else max(task.reference.sets, 1)
     p_value = fisher_tail((delay.value / delay.std) ** 2, 1, USUAL_DAYS + sets - 1)
-    finding = replace(finding, evidence=replace(finding.evidence, p_value=p_value))
+    apart = slow[0] - delay.value
+    if abs(apart) > _CONTRADICTED * np.hypot(slow[1], rest[1]):
+        delay = replace(delay, std=float(np.hypot(delay.std, apart)))
+    finding = replace(
+        finding, parameters={"delay": delay}, evidence=replace(finding.evidence, p_value=p_value)
+    )
     low, high = finding.evidence.gain_interval_95
     grounds = _grounds(claim, selection.claims, finding, bench, before, now, (low, high), False, seed)
     confidence = min(claim.confidence, probability(grounds), 1.0 if _seen(low, grounds) else _OPEN)

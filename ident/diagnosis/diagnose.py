@@ -195,10 +195,13 @@ def _first(task: Task, bench: DiagnosisBench) -> State:
 def _in_time(task: Task, state: State) -> State:
     """The same with late channels shifted in time, and findings of them."""
     late = _late(state.selection)
+    slow = {c.trial.candidate.cause: _at_low_speeds(state.bench, c) for c in late}
     doubtful = [
         c.trial.candidate.cause
         for c in late
-        if not (_late_at_all_speeds(state.bench, c) and _late_in_all_joints(state.bench, c))
+        if not (
+            _late_at_all_speeds(c, *slow[c.trial.candidate.cause]) and _late_in_all_joints(state.bench, c)
+        )
     ]
     if doubtful:
         task = replace(task, causes=[cause for cause in task.causes or EFFECTS if cause not in doubtful])
@@ -231,7 +234,8 @@ def _in_time(task: Task, state: State) -> State:
     timing, notes = [], []
     after = State(bench, selection, baseline=baseline, left_out=tuple(doubtful))
     for claim in late:
-        finding = confirmed_delay(task, after, claim, rest[claim.trial.candidate.cause])
+        cause = claim.trial.candidate.cause
+        finding = confirmed_delay(task, after, claim, rest[cause], slow[cause])
         unknown = _unknown_delay(task, claim)
         if abs(finding.parameters["delay"].value) <= unknown:
             notes.append(_own_delay(claim, unknown))
@@ -326,10 +330,14 @@ def _own_delay(claim: Claim, limit: float) -> str:
     )
 
 
-def _late_at_all_speeds(bench: DiagnosisBench, claim: Claim) -> bool:
+def _at_low_speeds(bench: DiagnosisBench, claim: Claim) -> tuple[float, float]:
+    """Delay of a late channel in slow rows and its standard deviation [s]."""
     bench.evidence.replace([])
+    return slow_delay(bench, claim.trial)
+
+
+def _late_at_all_speeds(claim: Claim, slow: float, std: float) -> bool:
     made = _made(claim)
-    slow, std = slow_delay(bench, claim.trial)
     return abs(slow - made) < 0.3 * abs(made) + 4.0 * std and abs(slow) > 0.3 * abs(made)
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -220,6 +221,22 @@ def test_reference_knows_how_late_a_channel_is(make: Make, chain: Chain, referen
     assert found.cause == "joint_torque_delay"
     assert found.parameters["delay"].value == pytest.approx(0.0013, abs=3e-4)
     assert diagnose(sessions, chain).claims == ()
+
+
+def test_a_delay_that_slow_rows_contradict_is_known_no_better_than_their_difference(
+    make: Make,
+    chain: Chain,
+    diagnosed: Callable[[Callable[[Signals], None]], Diagnosis],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (plain,) = diagnosed(late_motor).claims
+    module = importlib.import_module("ident.diagnosis.diagnose")
+    monkeypatch.setattr(module, "slow_delay", lambda *_: (0.0075, 1e-4))
+    (late,) = diagnose(pair(make, late_motor), chain).claims
+    assert plain.parameters["delay"].std < 5e-4
+    assert late.parameters["delay"].value == plain.parameters["delay"].value
+    assert late.parameters["delay"].std == pytest.approx(0.0015, abs=2e-4)
+    assert late.evidence.p_value == plain.evidence.p_value
 
 
 def test_gain_of_a_late_channel_counts_from_before_it_was_put_in_time(make: Make, chain: Chain) -> None:
