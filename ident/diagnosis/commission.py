@@ -25,6 +25,7 @@ from ident.diagnosis.bench import (
     prepare_bench,
 )
 from ident.diagnosis.broken_data import broken_channels, refuse, without_broken
+from ident.diagnosis.channel_delays import CHANNELS, channel_delays, common_delays, mean_of
 from ident.diagnosis.character import character
 from ident.diagnosis.evidence import Evidence, Floats, Rows
 from ident.diagnosis.held_out import held_out
@@ -48,12 +49,10 @@ from ident.diagnosis.usual_sizes import scores, usual_sizes
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
 from ident.effects.motion import dahl
-from ident.estimation.identify import IdentificationSettings, Known, observed
 from ident.estimation.turning import drive_coulomb
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.content import Recall
-from ident.rows.delay import Delay
 from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -72,7 +71,6 @@ _SETTLING = 2
 _TUNING_SETS = 3
 _ROUNDS = 3
 _LATEST_S = 0.02
-_CHANNELS = ("motor", "joint")
 # Share of the factor of a stated stiffness within which a fit is at its end.
 _END = 1.05
 # Share of healthy sets with a row above the largest error of the healthy ones.
@@ -259,8 +257,11 @@ def commission(
         tuned[side] = _tuned(arm_of_side, first, slow, 2, common_delays([told[side]]))
     side = min(sides, key=lambda one: tuned[one].misfit)
     log.info("positions of the %s", side)
-    further = [channel_delays(part, tuned[side].arm, settings) for part in parts[1:_TUNING_SETS]]
-    late = common_delays([told[side], *further])
+    delays = [
+        told[side],
+        *(channel_delays(part, tuned[side].arm, settings) for part in parts[1:_TUNING_SETS]),
+    ]
+    late = common_delays(delays)
     one = _tuned(tuned[side].arm, first, settings, _ROUNDS, late)
     several, base = [one.arm], one.base
     for recordings in recorded[1:_TUNING_SETS]:
@@ -272,9 +273,7 @@ def commission(
         # The delay of a channel depends on the reversal of friction, so it is settled last.
         days = [_day(known, recordings, settings, base) for recordings in recorded]
         open_s = {
-            side: float(np.mean([day.late[side][0] for day in days]))
-            for side in _CHANNELS
-            if side not in late
+            side: float(np.mean([day.late[side][0] for day in days])) for side in CHANNELS if side not in late
         }
         known = _later(known, open_s)
     known = replace(known, healthy=character(known, recorded, settings))
@@ -298,9 +297,15 @@ def commission(
         log.info("healthy set %d of %d", number + 1, len(parts))
     found = _reference(days, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
     provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals) | known.delays}
+    # From day to day a delay differs by as much as either kind of rows shows.
+    changes = {
+        side: max(std, delay_std([mean_of(own[side])[:2] for own in delays if own.get(side)] or [(0.0, 0.0)]))
+        for side, std in found.delay_std_s.items()
+    }
     return replace(
         found,
         model=replace(found.model, provenance=provenance),
+        delay_std_s=changes,
         shown=shown,
         usual=usual_sizes(tables),
         compliance_std=known.compliance_std,
@@ -350,7 +355,7 @@ def _tuned(
             bench.nominal.arm,
             presliding=presliding_length(bench.nominal, evidence.full.values[: len(base)]),
         )
-        arm = _later(arm, {side: mean_delay(nuisance, side)[0] for side in _CHANNELS if side not in late})
+        arm = _later(arm, {side: mean_delay(nuisance, side)[0] for side in CHANNELS if side not in late})
     return _Tuned(misfit, arm, base)
 
 
@@ -361,52 +366,6 @@ def _later(arm: NominalArm, by: Mapping[str, float]) -> NominalArm:
         motor_delay_s=arm.motor_delay_s + by.get("motor", 0.0),
         joint_delay_s=arm.joint_delay_s + by.get("joint", 0.0),
     )
-
-
-def channel_delays(
-    sessions: Sequence[Session], arm: NominalArm, settings: DiagnosisSettings
-) -> dict[str, list[Delay]]:
-    """Delays of the channels as `identify` finds them: from rows away from reversals, where presliding, which looks
-    like a delay, has no part. Without those that the rows do not tell.
-    """
-    springs = None
-    if arm.encoder == "link" and np.any(arm.compliance > 0.0):
-        springs = tuple((1.0 / np.maximum(arm.compliance, 1e-12)).tolist())
-    wanted = IdentificationSettings(
-        model=2 if any(session.motor is not None for session in sessions) else 1,
-        estimator="wls",
-        signals=replace(settings.signals, stiffness_nm_rad=springs),
-        coulomb=settings.law,
-        row_coulomb=settings.row_law,
-        couplings=arm.couplings,
-        essential=None,
-    )
-    known = Known(signal_reasons=("signal settings of the diagnosis",))
-    try:
-        prepared = observed(sessions, arm.chain, wanted, known=known).prepared
-    except DataError as error:
-        log.info("no delays from rows away from reversals: %s", error)
-        return {}
-    delays = {"motor": [one.delay for one in prepared], "joint": [one.joint_delay for one in prepared]}
-    return {
-        side: [one for one in own if one is not None and one.by_joint and one.std > 0.0]
-        for side, own in delays.items()
-    }
-
-
-def common_delays(sets: Sequence[Mapping[str, Sequence[Delay]]]) -> dict[str, float]:
-    """The delay of each channel [s] that the sets tell together, zero where it is none; without the sides that none of
-    them tells."""
-    found = {}
-    for side in _CHANNELS:
-        told = [one for own in sets for one in own.get(side, ())]
-        if told:
-            values, stds = np.array([(one.estimate, one.std) for one in told]).T
-            weights = stds**-2.0
-            mean = float(np.average(values, weights=weights))
-            earliest = min(one.earliest for one in told)
-            found[side] = Delay.of(mean, float(weights.sum() ** -0.5), "", {}, 1.0, earliest).seconds
-    return found
 
 
 def _middle(arms: Sequence[NominalArm]) -> NominalArm:
@@ -472,7 +431,7 @@ def _day(
         {side: np.sqrt(np.mean(rows.target**2, axis=0)) for side, rows in bench.nominal.rows.items()},
         bench.nominal.motions[0].motor_coulomb,
         slow_turns(bench.nominal, bench.evidence),
-        {side: mean_delay(nuisance, side) for side in _CHANNELS},
+        {side: mean_delay(nuisance, side) for side in CHANNELS},
         _gains(bench, selection.nuisance_rows),
         bench.nominal.whole_friction(values),
     )
@@ -587,7 +546,7 @@ def _reference(
         arm.presliding,
         arm.far,
         arm.far_share,
-        {side: delay_std([day.late[side] for day in days]) for side in _CHANNELS},
+        {side: delay_std([day.late[side] for day in days]) for side in CHANNELS},
         habits=True,
         masses=usual.masses,
         # Of a further day against the mean of these.

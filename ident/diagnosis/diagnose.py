@@ -25,6 +25,7 @@ from ident.diagnosis.broken_data import (
     worthless,
 )
 from ident.diagnosis.candidates import Candidate
+from ident.diagnosis.channel_delays import sides_apart
 from ident.diagnosis.conclusion import conclude
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import confirmed_delay
@@ -145,6 +146,9 @@ def _bench(task: Task) -> DiagnosisBench:
 def _begun(task: Task) -> tuple[Task, State]:
     """The task with the presliding lengths of these days, and its first selection. A claim of presliding pulls at the
     length of its drive, and a late motor, which reverses later, at all of them: these are the usual ones then."""
+    if task.reference is not None and task.arm.encoder_known and task.sound:
+        apart = sides_apart(task.sessions, task.arm, task.settings, task.reference)
+        task = replace(task, apart=apart)
     usual = task.arm.presliding
     task, bench = _of_these_days(task)
     first = _first(task, bench)
@@ -164,7 +168,7 @@ def _of_these_days(task: Task) -> tuple[Task, DiagnosisBench]:
     """The task with the presliding lengths of these days, and its bench: friction that turns over half or twice the
     length is not linear in the change of it."""
     bench, usual = _bench(task), task.arm.presliding
-    if task.reference is None or usual is None:
+    if task.reference is None or usual is None or "motor" in task.apart:
         return task, bench
     lengths = usual
     for _ in range(_LENGTHS):

@@ -18,6 +18,7 @@ from ident.diagnosis.result import Finding, SimulationError
 from ident.diagnosis.selection import Selection, select
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.usual_sizes import Healthy
+from ident.effects import DELAYS
 from ident.model import DynamicModel
 from lwr_driver.session import Session
 
@@ -30,7 +31,7 @@ class Task:
     """The input of a diagnosis, see `diagnose`. sessions, test : as given. arm : the nominal arm.
 
     causes : names to consider, None for all. model : the present model, None for the base model. sound : whether no
-    channel is broken.
+    channel is broken. apart : channels whose delay is clearly not the healthy arm's.
     """
 
     sessions: Sequence[Session]
@@ -43,6 +44,7 @@ class Task:
     model: DynamicModel | None
     simulate: Simulate | None
     sound: bool = True
+    apart: frozenset[str] = frozenset()
 
     @property
     def everything(self) -> list[Session]:
@@ -52,7 +54,8 @@ class Task:
     @cached_property
     def healthy(self) -> Healthy | None:
         """What healthy sets say of the candidates."""
-        return None if self.reference is None else self.reference.healthy()
+        late = [DELAYS[side].cause for side in self.apart]
+        return None if self.reference is None else self.reference.healthy().without(late)
 
     @property
     def limits(self) -> Mapping[tuple[str, int], float] | None:

@@ -6,9 +6,9 @@ no measure of changes. So a candidate is also held against its mean size, by the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,7 @@ _THERE = 9.0
 # Largest change of a size from day to day as a share of it: three standard deviations of friction's.
 _LARGEST_SHARE = 0.3
 
+_Any = TypeVar("_Any")
 Key = tuple[str, int]
 """Cause, and joint from 0."""
 Table = Mapping[Key, Mapping[str, Score]]
@@ -91,6 +92,14 @@ class Healthy:
     limits: Mapping[Key, float] = field(default_factory=dict)
     shown: Mapping[Key, Mapping[str, float]] = field(default_factory=dict)
     sizes: Mapping[Key, tuple[UsualSize, float]] = field(default_factory=dict)
+
+    def without(self, causes: Collection[str]) -> Healthy:
+        """The same, saying nothing of these causes."""
+
+        def others(table: Mapping[Key, _Any]) -> dict[Key, _Any]:
+            return {key: value for key, value in table.items() if key[0] not in causes}
+
+        return Healthy(others(self.limits), others(self.shown), others(self.sizes))
 
 
 def scores(dictionary: Dictionary) -> Table:

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.diagnosis import bench
+from ident.diagnosis import bench, channel_delays
 from ident.diagnosis.candidates import Candidate, Trial
+from ident.diagnosis.channel_delays import common_delays
 from ident.diagnosis.commission import (
     as_stated,
-    common_delays,
     compliance_std,
     delay_std,
     gain_std,
@@ -314,10 +314,11 @@ def _score(gain: float, count: int = 1) -> Score:
     return Score(gain, gain, np.ones(count), 1.0, lambda: (np.eye(count), 40))
 
 
-def test_a_delay_that_one_set_does_not_tell_is_that_of_the_others() -> None:
-    def told(seconds: float, std: float, earliest: float = 0.0) -> Delay:
-        return Delay(max(seconds, earliest), std, "told", estimate=seconds, earliest=earliest)
+def told(seconds: float, std: float, earliest: float = 0.0) -> Delay:
+    return Delay(max(seconds, earliest), std, "told", estimate=seconds, earliest=earliest)
 
+
+def test_a_delay_that_one_set_does_not_tell_is_that_of_the_others() -> None:
     precise, vague = told(2e-3, 1e-4), told(9e-3, 5e-3)
     assert common_delays([{"motor": []}, {"motor": [precise]}]) == {"motor": 2e-3}
     assert common_delays([{"motor": [vague]}, {"motor": [precise]}])["motor"] == pytest.approx(2e-3, abs=1e-5)
@@ -326,3 +327,33 @@ def test_a_delay_that_one_set_does_not_tell_is_that_of_the_others() -> None:
     assert common_delays([{"motor": [told(-7e-3, 1e-3)]}]) == {"motor": 0.0}
     assert common_delays([{"joint": [told(-7e-3, 1e-3, -np.inf)]}]) == {"joint": -7e-3}
     assert common_delays([{"motor": [], "joint": []}]) == {}
+
+
+@pytest.mark.parametrize(
+    ("delays", "apart"),
+    [
+        ([5.9e-3, 6.2e-3], True),
+        ([3.4e-3, 3.6e-3], False),
+        # Sessions that contradict each other tell less than each says of itself.
+        ([3.1e-3, 8.9e-3], False),
+    ],
+)
+def test_a_delay_apart_from_the_healthy_one_is_told_by_rows_away_from_reversals(
+    delays: list[float], apart: bool, arm: NominalArm, model: DynamicModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        channel_delays,
+        "channel_delays",
+        lambda *_: {"motor": [told(one, 2e-4) for one in delays], "joint": []},
+    )
+    known = replace(reference(model, {}, 2), delay_std_s={"motor": 2e-4})
+    late = replace(arm, motor_delay_s=3e-3)
+    found = channel_delays.sides_apart([], late, DiagnosisSettings(), known)
+    assert found == (frozenset({"motor"}) if apart else frozenset())
+
+
+def test_healthy_sets_can_say_nothing_of_a_cause() -> None:
+    first, second = ("stribeck", 0), ("motor_torque_delay", -1)
+    healthy = Healthy({first: 50.0, second: 300.0}, {first: {"v": 1.0}, second: {"v": 1.0}})
+    others = healthy.without(["motor_torque_delay"])
+    assert (others.limits, others.shown, others.sizes) == ({first: 50.0}, {first: {"v": 1.0}}, {})
