@@ -298,10 +298,10 @@ def commission(
     found = _reference(days, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
     provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals) | known.delays}
     # From day to day a delay differs by as much as either kind of rows shows.
-    changes = {
-        side: max(std, delay_std([mean_of(own[side])[:2] for own in delays if own.get(side)] or [(0.0, 0.0)]))
-        for side, std in found.delay_std_s.items()
-    }
+    changes = dict(found.delay_std_s)
+    for side in CHANNELS:
+        by_set = [mean_of(own[side])[:2] for own in delays if own.get(side)]
+        changes[side] = max(changes[side], delay_std(by_set) if len(by_set) > 1 else 0.0)
     return replace(
         found,
         model=replace(found.model, provenance=provenance),
