@@ -299,9 +299,9 @@ def commission(
     provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals) | known.delays}
     # From day to day a delay differs by as much as either kind of rows shows.
     changes = dict(found.delay_std_s)
-    for side in CHANNELS:
-        by_set = [mean_of(own[side])[:2] for own in delays if own.get(side)]
-        changes[side] = max(changes[side], delay_std(by_set) if len(by_set) > 1 else 0.0)
+    for channel in CHANNELS:
+        by_set = [mean_of(own[channel])[:2] for own in delays if own.get(channel)]
+        changes[channel] = max(changes[channel], delay_std(by_set) if len(by_set) > 1 else 0.0)
     return replace(
         found,
         model=replace(found.model, provenance=provenance),
