@@ -20,8 +20,8 @@ from lwr_driver.session import Session
 log = logging.getLogger(__name__)
 
 CHANNELS = ("motor", "joint")
-# Probability of a healthy delay beyond the limit: three standard deviations of a normal distribution.
-_ONE_IN = 0.0027
+ONE_IN = 0.0027
+"""Largest probability of a late channel's delay on a healthy arm: three normal standard deviations."""
 
 
 def channel_delays(
@@ -84,7 +84,7 @@ def sides_apart(
         mean, std, chi = mean_of(told)
         apart = mean - (arm.motor_delay_s if side == "motor" else arm.joint_delay_s)
         variance = (chi * std) ** 2 + reference.delay_std_s.get(side, DELAY_STD_S) ** 2
-        if fisher_tail(apart**2 / variance, 1, USUAL_DAYS + max(reference.sets, 1) - 1) < _ONE_IN:
+        if fisher_tail(apart**2 / variance, 1, USUAL_DAYS + max(reference.sets, 1) - 1) < ONE_IN:
             found.add(side)
     return frozenset(found)
 

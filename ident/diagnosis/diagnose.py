@@ -25,7 +25,7 @@ from ident.diagnosis.broken_data import (
     worthless,
 )
 from ident.diagnosis.candidates import Candidate
-from ident.diagnosis.channel_delays import sides_apart
+from ident.diagnosis.channel_delays import ONE_IN, sides_apart
 from ident.diagnosis.conclusion import conclude
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import confirmed_delay
@@ -46,8 +46,6 @@ from ident.rows.content import Recall
 from ident.rows.sessions import require
 from lwr_driver.session import Sessions, as_sessions
 
-# Largest probability of a late channel's delay on a healthy arm.
-_ONE_IN = 0.0027
 # Largest number of shifts of a late channel.
 _SHIFTS = 5
 # Unit of delay for a column [s].
@@ -244,7 +242,7 @@ def _in_time(task: Task, state: State) -> State:
         if abs(finding.parameters["delay"].value) <= unknown:
             notes.append(_own_delay(claim, unknown))
         # A delay explained by the rest of the model, or usual from day to day, is no finding.
-        elif finding.evidence.p_value < _ONE_IN:
+        elif finding.evidence.p_value < ONE_IN:
             if believable(finding.grounds):
                 timing.append(finding)
             else:
