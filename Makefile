@@ -6,7 +6,8 @@ READY := $(VENV)/.ready
 TEST_READY := $(VENV)/.test-ready
 # Without its bytecode each process of the tests would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
-PIP := $(BIN)/pip install --quiet --disable-pip-version-check
+# A module is compiled where it is first imported: most of what comes along never is.
+PIP := $(BIN)/pip install --quiet --disable-pip-version-check --no-compile
 
 .PHONY: help setup experiment test test-long quick hooks lint browser compiled docs pictures screenshot clean
 
@@ -21,15 +22,18 @@ help:
 	@echo "make screenshot   take the pictures of the documents again"
 	@echo "make clean        remove the virtual environment and the caches"
 
-$(READY): pyproject.toml
+$(BIN)/pip:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed, found " + sys.version.split()[0] + "; set PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
+
+$(READY): pyproject.toml | $(BIN)/pip
 	$(PIP) --editable '.[view]'
 	@touch $(READY)
 
-$(TEST_READY): $(READY)
+# One installation: what the tests need has in it what the experiment needs.
+$(TEST_READY): pyproject.toml | $(BIN)/pip
 	$(PIP) --editable '.[test]'
-	@touch $(TEST_READY)
+	@touch $(READY) $(TEST_READY)
 
 setup: $(TEST_READY) browser
 

@@ -1,4 +1,4 @@
-"""The optional packages of a notebook: pandas for tables, matplotlib for figures."""
+"""What results need in a notebook: optional packages, and figures."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ def optional(package: str, use: str, instead: str, extra: str = "notebook") -> A
         ) from error
 
 
-def subplots(use: str, instead: str, rows: int, columns: int = 1, **settings: Any) -> Any:
-    """The axes (rows * columns,) of a new figure. Raises ConfigurationError without matplotlib."""
-    pyplot = optional("matplotlib.pyplot", use, instead)
+def subplots(rows: int, columns: int = 1, **settings: Any) -> Any:
+    """The axes (rows * columns,) of a new figure."""
+    from matplotlib import pyplot
+
     _, axes = pyplot.subplots(rows, columns, squeeze=False, layout="constrained", **settings)
     return axes.ravel()

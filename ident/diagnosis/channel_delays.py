@@ -14,7 +14,7 @@ from ident.diagnosis.reference import DELAY_STD_S, USUAL_DAYS, Reference
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.estimation.identify import IdentificationSettings, Known, observed
 from ident.estimators.estimate import fisher_tail
-from ident.rows.delay import Delay
+from ident.rows.delay import Delay, weighted_mean
 from lwr_driver.session import Session
 
 log = logging.getLogger(__name__)
@@ -91,8 +91,4 @@ def sides_apart(
 
 def mean_of(delays: Sequence[Delay]) -> tuple[float, float, float]:
     """Weighted mean of estimates, its standard deviation [s], and their scatter over their deviations, one at least."""
-    values, stds = np.array([(one.estimate, one.std) for one in delays]).T
-    weights = stds**-2.0
-    mean = float(np.average(values, weights=weights))
-    chi = float(np.sqrt(np.sum(weights * (values - mean) ** 2) / max(len(values) - 1, 1)))
-    return mean, float(weights.sum() ** -0.5), max(chi, 1.0)
+    return weighted_mean(np.array([one.estimate for one in delays]), np.array([one.std for one in delays]))

@@ -261,13 +261,10 @@ class Diagnosis(Tabular):
         ]
 
     def plot(self) -> Any:
-        """RMS error on held-out rows by joint, before and after; the matplotlib Axes, one for each side.
-
-        Raises ConfigurationError without matplotlib.
-        """
+        """RMS error on held-out rows by joint, before and after; the matplotlib Axes, one for each side."""
         sides = list(self.rms_base)
         size = (4.0 * len(sides), 3.0)
-        axes = subplots("Diagnosis: plot()", "to_dict()", 1, len(sides), figsize=size)
+        axes = subplots(1, len(sides), figsize=size)
         for axis, side in zip(axes, sides, strict=True):
             rows = (
                 ("noise floor", self.noise_floor.get(side)),

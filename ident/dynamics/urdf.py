@@ -12,6 +12,7 @@ import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,7 @@ class Urdf:
     name: str
     text: str
     joints: tuple[Joint, ...]
-    inertials: dict[str, Floats]
+    inertials: Mapping[str, Floats]
 
     @property
     def root(self) -> str:
@@ -297,7 +298,12 @@ def read_urdf(source: str | Path) -> Urdf:
 
     Raises ConfigurationError with file, element and remedy for an invalid URDF.
     """
-    text, place = _text(source)
+    return _parsed(*_text(source))
+
+
+# A command asks for one arm's bodies, joints and limits many times.
+@lru_cache(maxsize=8)
+def _parsed(text: str, place: str) -> Urdf:
     try:
         tree = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -314,6 +320,11 @@ def read_urdf(source: str | Path) -> Urdf:
                 raise ConfigurationError(
                     f"{place}: joint {joint.name!r} refers to link {name!r}, missing in the file"
                 )
+    for shared in (
+        *inertials.values(),
+        *(values for joint in joints for values in (joint.origin, joint.axis)),
+    ):
+        shared.setflags(write=False)
     return Urdf(tree.get("name", "robot"), text, joints, inertials)
 
 

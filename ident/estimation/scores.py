@@ -151,7 +151,7 @@ class SessionScore(Tabular):
         """Measured and computed torque of each joint over time; the matplotlib Axes, one for each joint.
 
         side : `joint` or `motor`; default the first of the model. Raises ConfigurationError for a side without
-        scores, or without matplotlib.
+        scores.
         """
         side = next(iter(self.traces), "") if side is None else side
         if side not in self.traces:
@@ -162,7 +162,7 @@ class SessionScore(Tabular):
         trace = self.traces[side]
         joints = [score.joint for score in self.scores if score.side == side]
         size = (8.0, 1.3 * len(joints))
-        axes = subplots(f"{type(self).__name__}: plot()", "records()", len(joints), sharex=True, figsize=size)
+        axes = subplots(len(joints), sharex=True, figsize=size)
         for k, (axis, joint) in enumerate(zip(axes, joints, strict=True)):
             axis.plot(trace.times, trace.measured[:, k], linewidth=0.8, label="measured")
             axis.plot(trace.times, trace.computed[:, k], linewidth=0.8, label=self.predictor)

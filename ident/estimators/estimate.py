@@ -120,15 +120,12 @@ class Estimate(Tabular):
         return rows_of(name=self.names, unit=self._units, estimate=values, std=std, rsd_percent=rsd)
 
     def plot(self) -> Any:
-        """Values with their 95 % intervals; the matplotlib Axes, one for each unit.
-
-        Raises ConfigurationError without matplotlib.
-        """
+        """Values with their 95 % intervals; the matplotlib Axes, one for each unit."""
         units = list(dict.fromkeys(self._units))
         groups = [[k for k, unit in enumerate(self._units) if unit == wanted] for wanted in units]
         height = 0.6 + 0.16 * max(map(len, groups))
         size = (2.6 * len(units), height)
-        axes = subplots("Estimate: plot()", "records()", 1, len(units), figsize=size)
+        axes = subplots(1, len(units), figsize=size)
         half = self.interval()[:, 1] - self.values
         for axis, unit, group in zip(axes, units, groups, strict=True):
             names = [self.names[k] for k in group]

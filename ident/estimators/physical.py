@@ -312,15 +312,18 @@ def nearest_consistent(inertial: Floats, *, margin: float = 1e-2) -> Floats:
 
     margin : smallest eigenvalue of each pseudo-inertia relative to a compact body of that mass.
     """
-    result = []
-    for body in np.atleast_2d(np.asarray(inertial, dtype=np.float64)):
-        mass = max(float(body[9]), 1e-3)
-        floor = margin * _compact(mass)
-        weights = 1.0 / _sizes(body) ** 2
-        rows, offset, cones = _psd_rows(np.arange(_BODY), _BODY, floor)
-        solution = _run(sparse.diags(2.0 * weights).tocsc(), -2.0 * weights * body, rows, offset, cones)
-        result.append(solution)
-    return np.array(result)
+    bodies = np.atleast_2d(np.asarray(inertial, dtype=np.float64))
+    return np.array([_nearest_body(tuple(body), margin) for body in bodies.tolist()])
+
+
+# A convex program, and fits of one arm ask for the same bodies again and again.
+@lru_cache(maxsize=64)
+def _nearest_body(stated: tuple[float, ...], margin: float) -> Floats:
+    body = np.array(stated)
+    floor = margin * _compact(max(float(body[9]), 1e-3))
+    weights = 1.0 / _sizes(body) ** 2
+    rows, offset, cones = _psd_rows(np.arange(_BODY), _BODY, floor)
+    return _run(sparse.diags(2.0 * weights).tocsc(), -2.0 * weights * body, rows, offset, cones)
 
 
 def _run(quadratic: sparse.csc_matrix, linear: Floats, rows: Floats, offset: Floats, cones: list) -> Floats:
@@ -455,7 +458,7 @@ _PAYLOAD_STD = 3.0
 _DISSIPATIVE = ("Ia", "Fvl", "Fcl", "Fvm", "Fcm")
 
 
-# The nearest rigid bodies are a convex program, and every fit of a diagnosis asks.
+# Every fit of a diagnosis asks.
 @lru_cache(maxsize=16)
 def lacking_bodies(chain: Chain) -> str:
     """Why there is no prior of the arm's bodies, in words; empty if the URDF is one."""

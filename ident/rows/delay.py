@@ -258,13 +258,17 @@ def _estimated(
 
 def _together(names: Sequence[str], values: Floats, stds: Floats, how: str, earliest_s: float) -> Delay:
     """The delay of a channel from those of its joints with standard deviations (J,)."""
-    weights = stds**-2.0
-    mean = float(np.sum(weights * values) / np.sum(weights))
-    chi = float(np.sqrt(np.sum(weights * (values - mean) ** 2) / max(len(values) - 1, 1)))
-    disagreement = max(1.0, chi)
+    mean, std, disagreement = weighted_mean(values, stds)
     by_joint = {name: (float(v), float(s)) for name, v, s in zip(names, values, stds, strict=True)}
-    std = float(np.sum(weights)) ** -0.5 * disagreement
-    return Delay.of(mean, std, how, by_joint, disagreement, earliest_s)
+    return Delay.of(mean, std * disagreement, how, by_joint, disagreement, earliest_s)
+
+
+def weighted_mean(values: Floats, stds: Floats) -> tuple[float, float, float]:
+    """Mean of estimates (n,) with standard deviations (n,), its own, and their scatter over theirs, one at least."""
+    weights = stds**-2.0
+    mean = float(np.average(values, weights=weights))
+    chi = float(np.sqrt(np.sum(weights * (values - mean) ** 2) / max(len(values) - 1, 1)))
+    return mean, float(weights.sum()) ** -0.5, max(chi, 1.0)
 
 
 def delays_from_model(

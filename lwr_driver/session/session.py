@@ -306,22 +306,13 @@ class Session:
         return pandas.DataFrame(columns, index=time)
 
     def plot(self) -> Any:
-        """Positions, joint and motor torques over time; the matplotlib Axes, one for each channel with values.
-
-        ConfigurationError without matplotlib.
-        """
+        """Positions, joint and motor torques over time; the matplotlib Axes, one for each channel with values."""
         panels = [("position [rad]", self.joint, self.joint.position)]
         if self.joint.effort.shape[1]:
             panels.append(("joint torque [Nm]", self.joint, self.joint.effort))
         if self.motor is not None:
             panels.append(("motor torque [Nm]", self.motor, self.motor.effort))
-        axes = subplots(
-            "Session: plot()",
-            "the arrays of `session.joint`",
-            len(panels),
-            sharex=True,
-            figsize=(8.0, 2.2 * len(panels)),
-        )
+        axes = subplots(len(panels), sharex=True, figsize=(8.0, 2.2 * len(panels)))
         for axis, (label, channel, values) in zip(axes, panels, strict=True):
             for name, column in zip(channel.names, values.T, strict=True):
                 axis.plot((channel.log_time - self.start) * 1e-9, column, linewidth=0.8, label=name)

@@ -157,15 +157,6 @@ def test_figures_hold_the_numbers(found: Any, logs: tuple[Path, Path]) -> None:
         result.plot(1)
 
 
-def test_without_matplotlib_the_advice_is_to_install_it(
-    found: Any, logs: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
-    for thing in (found, read_session(logs[0])):
-        with pytest.raises(ConfigurationError, match=r"needs matplotlib, .*'lwr-identification\[notebook\]'"):
-            thing.plot()
-
-
 def test_a_diagnosis_is_short_a_table_and_a_figure(found: Any) -> None:
     finding = Finding(
         cause="joint_elasticity",

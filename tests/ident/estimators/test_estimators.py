@@ -560,7 +560,6 @@ def test_a_record_may_begin_at_any_time(estimator):
 
 
 def test_a_plot_has_each_value_in_the_middle_of_its_interval():
-    pytest.importorskip("matplotlib")
     estimate = WeightedLeastSquares().fit(sample())
     (axis,) = estimate.plot()
     np.testing.assert_allclose(axis.lines[0].get_xdata(), estimate.values)
