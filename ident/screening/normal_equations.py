@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrs, dpstrf
 
 from ident.dynamics.parameters import Floats
@@ -29,31 +31,64 @@ _DEPENDENT = 1e-9
 _NOTHING = 1e-10
 
 
+class Blocks(NamedTuple):
+    """Symmetric matrices G (m, p, p) by their columns that are not zero.
+
+    matrix : (m, u, u), for the c <= u columns of each in the first c rows and columns. columns : (m, u), rising.
+    sizes : c (m,).
+    """
+
+    matrix: Floats
+    columns: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, matrices: Sequence[Floats], columns: Sequence[NDArray[np.int64]]) -> Blocks:
+        """From each matrix (c, c) and its columns (c,)."""
+        sizes = np.array([len(own) for own in columns], dtype=np.int64)
+        most = int(sizes.max(initial=0))
+        matrix, places = np.zeros((len(sizes), most, most)), np.zeros((len(sizes), most), dtype=np.int64)
+        for k, (block, own) in enumerate(zip(matrices, columns, strict=True)):
+            matrix[k, : len(own), : len(own)], places[k, : len(own)] = block, own
+        return cls(matrix, places, sizes)
+
+
 @dataclass(frozen=True)
 class Normal:
     """Normal equations of the m classes, the torques' of the o parts.
 
-    matrix : G (m, p, p). mixed : B^T (m, o, n + 2, p). scatter, square : T (m, o, n + 2, n + 2) without the mean of the
+    matrix : G. mixed : B^T (m, o, n + 2, p). scatter, square : T (m, o, n + 2, n + 2) without the mean of the
     session, and S with it. prior : of the bodies, by the URDF's.
     """
 
     classes: tuple[Class, ...]
     parts: tuple[Part, ...]
-    matrix: Floats
+    matrix: Blocks
     mixed: Floats
     scatter: Floats
     square: Floats
     prior: Prior
 
     def total(self, fit: Fit) -> Floats:
-        """Weighted sum of the matrices and the prior's precision, (p, p)."""
-        weights = [fit.weight[key] for key in self.classes]
-        return np.tensordot(weights, self.matrix, 1) + fit.nominal * self.prior.precision
+        """Weighted sum of the matrices and the prior's precision, (p, p), its lower triangle."""
+        return self.weighted(np.array([fit.weight[key] for key in self.classes]), fit.nominal)
+
+    def weighted(self, weights: Floats, nominal: float) -> Floats:
+        """The same by weights (m,) of the classes and one of the prior."""
+        out = nominal * self.prior.precision
+        _add_weighted(*self.matrix, weights, out)
+        return out
+
+    def squares(self, values: Floats) -> Floats:
+        """x^T G x (m,) of the classes for parameters x (p,)."""
+        out = np.empty(len(self.classes))
+        _squares(*self.matrix, values, out)
+        return out
 
     @property
     def by_data(self) -> Normal:
         """The same without the prior, for what the data alone have to tell: a wrong URDF bends what they hardly do."""
-        width = self.matrix.shape[-1]
+        width = self.mixed.shape[-1]
         return replace(self, prior=Prior(np.zeros(width), np.zeros((width, width))))
 
     @property
@@ -93,15 +128,12 @@ def reweighted(normal: Normal, sums: Sums, start: Floats, nominal_weight: float,
     """The fit by reweighting. start : squared residuals (m,) of the first weights. nominal_weight : first one."""
     mixed, square, total = sums
     least = FLOOR**2 * total
-    count, width, _ = normal.matrix.shape
-    flat, prior = normal.matrix.reshape(count * width, width), normal.prior
+    prior = normal.prior
     pull = prior.precision @ prior.mean
     weight, firm, error, values, cost = 1.0 / start, nominal_weight, total, np.zeros(0), np.inf
     for _ in range(rounds):
-        left = (weight @ flat.reshape(count, -1)).reshape(width, width) + firm * prior.precision
-        values = solve(left, weight @ mixed + firm * pull)
-        fitted = (flat @ values).reshape(count, width) @ values
-        error = np.maximum(square - 2.0 * mixed @ values + fitted, 0.0)
+        values = solve(normal.weighted(weight, firm), weight @ mixed + firm * pull)
+        error = np.maximum(square - 2.0 * mixed @ values + normal.squares(values), 0.0)
         weight = 1.0 / np.maximum(error, least)
         apart = values - prior.mean
         distance = float(apart @ prior.precision @ apart)
@@ -122,12 +154,52 @@ def reweighted(normal: Normal, sums: Sums, start: Floats, nominal_weight: float,
 
 
 def solve(matrix: Floats, right: Floats) -> Floats:
-    """Solution of the normal equations in the excited columns (Cholesky with pivots), zero in the others."""
+    """Solution of the normal equations in the excited columns, zero in the others; arguments as for `factored`."""
+    return factored(matrix)(right)
+
+
+def factored(matrix: Floats) -> Callable[[Floats], Floats]:
+    """The solution of the normal equations by their right side (p,) (Cholesky with pivots).
+
+    matrix : (p, p), of which the lower triangle counts.
+    """
     scale = np.sqrt(np.diag(matrix))
     scale = np.where(scale > max(_NOTHING * np.max(scale, initial=0.0), 1e-150), scale, np.inf)
     # Column-major as LAPACK has it; the matrix is symmetric.
     factor, order, rank, _ = dpstrf((matrix / (scale[:, None] * scale)).T, tol=_DEPENDENT, overwrite_a=1)
     kept = order[:rank] - 1
-    found = np.zeros(len(right))
-    found[kept] = dpotrs(factor[:rank, :rank], (right / scale)[kept])[0].ravel() / scale[kept]
-    return found
+
+    def solution(right: Floats) -> Floats:
+        found = np.zeros(len(right))
+        found[kept] = dpotrs(factor[:rank, :rank], (right / scale)[kept])[0].ravel() / scale[kept]
+        return found
+
+    return solution
+
+
+@njit(cache=True, nogil=True)
+def _add_weighted(
+    matrix: Floats, columns: NDArray[np.int64], sizes: NDArray[np.int64], weights: Floats, out: Floats
+) -> None:
+    """Adds the lower triangle of the weighted sum of `Blocks` to out (p, p)."""
+    for k in range(len(matrix)):
+        own = columns[k]
+        for a in range(sizes[k]):
+            row, total = matrix[k, a], out[own[a]]
+            for b in range(a + 1):
+                total[own[b]] += weights[k] * row[b]
+
+
+@njit(cache=True, nogil=True)
+def _squares(
+    matrix: Floats, columns: NDArray[np.int64], sizes: NDArray[np.int64], values: Floats, out: Floats
+) -> None:
+    """x^T G x (m,) from the lower triangles of `Blocks`."""
+    for k in range(len(matrix)):
+        own = values[columns[k]]
+        out[k] = 0.0
+        for a in range(sizes[k]):
+            row, before = matrix[k, a], 0.0
+            for b in range(a):
+                before += row[b] * own[b]
+            out[k] += own[a] * (2.0 * before + row[a] * own[a])

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from ident.dynamics.parameters import Floats
-from ident.screening.normal_equations import Class, Fit, Normal, Part, solve
+from ident.screening.normal_equations import Class, Fit, Normal, Part, factored
 from ident.screening.redundancy import Redundancy, SampledRows, Size
 
 GAIN, DEVIATIONS = 0.18, 5.0
@@ -99,7 +99,7 @@ def _suspects(
             shared[where] += added @ own
             power[where] += np.sum(added**2, axis=1)
             product[where] += added @ error
-    total = normal.total(fit)
+    solution = factored(normal.total(fit))
     chosen = [
         np.array([data.map_of(side, part)[joint] for part in normal.parts]) for side, joint in normal.classes
     ]
@@ -117,7 +117,7 @@ def _suspects(
             for parts in whole if kind == "drift" else scopes(normal.parts):
                 at = [place[part] for part in parts]
                 vector = weight * shared[k, at, number].sum(axis=0)
-                left = weight * power[k, at, number].sum() - vector @ solve(total, vector)
+                left = weight * power[k, at, number].sum() - vector @ solution(vector)
                 if left <= 1e-9 * weight * power[k, at, number].sum():
                     continue
                 size = weight * product[k, at, number].sum() / left

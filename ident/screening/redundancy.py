@@ -36,7 +36,18 @@ from ident.rows.prepare import prepare
 from ident.rows.prepared import TorqueChannel
 from ident.rows.sessions import payload_name
 from ident.screening.nominal import nominal
-from ident.screening.normal_equations import BLOCK, ROUNDS, Class, Fit, Normal, Part, Sums, reweighted, solve
+from ident.screening.normal_equations import (
+    BLOCK,
+    ROUNDS,
+    Blocks,
+    Class,
+    Fit,
+    Normal,
+    Part,
+    Sums,
+    factored,
+    reweighted,
+)
 from lwr_driver.session import Session
 
 _BODY = len(INERTIAL)
@@ -301,7 +312,7 @@ class Redundancy:
         classes = [(side, j) for side in self.sides for j in range(n)]
         place = {key: k for k, key in enumerate(key for key in classes if key not in self.silent)}
         width, parts = self.width, tuple(sorted({rows.part for rows in self.rows}))
-        matrix = np.zeros((len(place), width, width))
+        blocks, used = [np.zeros((0, 0))] * len(place), [np.zeros(0, dtype=np.int64)] * len(place)
         mixed = np.zeros((len(place), len(parts), n + 2, width))
         scatter, square = np.zeros((2, len(place), len(parts), n + 2, n + 2))
         means = self._means()
@@ -310,13 +321,14 @@ class Redundancy:
             joints = [j for j in range(n) if (side, j) in place]
             at = [place[side, j] for j in joints]
             columns = self._columns(rows)
+            acting = np.asarray(columns.any(axis=2))
             moving = np.concatenate([one.moving for one in rows]).T[joints, :, None]
             seen = np.concatenate([_extended(one) for one in rows]) * moving
             for k, joint, weight in zip(at, joints, moving, strict=True):
                 # A joint's torque has the bodies behind it and its own drive alone.
-                used = np.flatnonzero(columns[:, joint].any(axis=1))
-                part = columns[used, joint] * weight[:, 0]
-                matrix[k, used[:, None], used] = part @ part.T
+                used[k] = np.flatnonzero(acting[:, joint])
+                part = columns[used[k], joint] * weight[:, 0]
+                blocks[k] = part @ part.T
             begin = 0
             for one in rows:
                 rest = slice(begin, begin := begin + len(one.q))
@@ -327,7 +339,7 @@ class Redundancy:
                 scatter[at, o] += _transposed(centred) @ centred
                 square[at, o] += _transposed(some) @ some
         prior = nominal(self.chain, width, _ORDER)
-        return Normal(tuple(place), parts, matrix, mixed, scatter, square, prior)
+        return Normal(tuple(place), parts, Blocks.of(blocks, used), mixed, scatter, square, prior)
 
     def _means(self) -> dict[tuple[str, int], Floats]:
         """Means (n, n + 2) of torques, one and time of a side of a session, over the moving rows of each joint."""
@@ -438,7 +450,7 @@ class Redundancy:
         errors : of each the columns (n, K) for all sets of rows, what an error by one adds to the computed torques
             [Nm]. Their projection on the parameters is taken off. The prior's deviations are in that of the size.
         """
-        total = normal.total(fit)
+        solution = factored(normal.total(fit))
         table = []
         for rows in self.rows:
             matrix = self.matrix(rows)
@@ -451,7 +463,7 @@ class Redundancy:
                 for own, c, w in zip(matrix, column, weight, strict=True):
                     if w.any() and c.any():
                         shared += (w * c) @ own
-            others = solve(total, shared)
+            others = solution(shared)
             parts = [
                 (column, column - matrix @ others, weight, left)
                 for (matrix, weight, left), column in zip(table, columns, strict=True)
@@ -495,8 +507,7 @@ class Redundancy:
     def deviation(self, fit: Fit, normal: Normal, directions: Floats) -> Floats:
         """Standard deviation (m,) of the combinations `directions` (m, p) of the parameters, by blocks of rows
         and the prior's."""
-        total = normal.total(fit)
-        spreads = np.column_stack([solve(total, direction) for direction in directions])
+        spreads = np.column_stack([*map(factored(normal.total(fit)), directions)])
         variance = fit.nominal / normal.rows * np.sum(spreads * (normal.prior.precision @ spreads), axis=0)
         for rows in self.rows:
             measured = self.true_torque(rows).T
