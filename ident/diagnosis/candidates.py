@@ -97,6 +97,7 @@ def _scan(counts: Floats, sums: Floats) -> Iterator[tuple[int, int, float]]:
     number, total = (np.concatenate([[0.0], np.cumsum(values)]) for values in (counts, sums))
     for _ in range(_MOST):
         best = (0.0, 0, 0, 0.0)
+        taken = np.concatenate([[0], np.cumsum(~free)])
         for length in (2**k for k in range(int(np.log2(_LONGEST_S / _WINDOW_S)) + 1)):
             if length > len(counts):
                 break
@@ -110,7 +111,7 @@ def _scan(counts: Floats, sums: Floats) -> Iterator[tuple[int, int, float]]:
                 level = np.where((at == beside) & (there > level), there, level)
             excess = chi - level * rows
             clear = excess / (level * np.sqrt(2.0 * np.maximum(rows, 1.0)))
-            clear[(rows == 0.0) | [not free[k : k + length].all() for k in starts]] = 0.0
+            clear[(rows == 0.0) | (taken[starts + length] > taken[starts])] = 0.0
             place = int(np.argmax(clear))
             if clear[place] > best[0]:
                 best = (float(clear[place]), place, length, float(excess[place]))
