@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ident.diagnosis.selection import margin
+from ident.diagnosis.rivals import margin
 from ident.effects import EFFECTS, described, summary_of
 from ident.effects.words import joints_text, named, quantity_text, spoken
 

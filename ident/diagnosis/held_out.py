@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
+if TYPE_CHECKING:  # what words about a diagnosis need of this module starts faster
+    from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
 
 _DRAWS = 1000
 FELT_WORSE = 0.01

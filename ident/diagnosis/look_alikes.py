@@ -19,7 +19,7 @@ from ident.diagnosis.candidates import Candidate
 from ident.diagnosis.evidence import Floats, Rows
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Diagnosis, Finding
-from ident.diagnosis.selection import margin
+from ident.diagnosis.rivals import margin
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.signatures import Signature, overlap, signature_bench, signatures
 from ident.dynamics.kinematics import Chain

@@ -17,11 +17,11 @@ import numpy as np
 from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Floats, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
+from ident.diagnosis.rivals import confidence, look_alikes, margin
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.tolerances import HABIT, HABITUAL, LENGTH, Tolerance, tolerances, usual_change
 from ident.diagnosis.usual_sizes import Healthy
 from ident.effects import Shape
-from ident.estimators.estimate import normal_tail
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +43,6 @@ _LEAST_HABIT, _NEAR, _MOST_HABITS = 100.0, 0.5, 4
 _LEAST_GAIN = 10.0
 # Confidence in a sensor's error with a record of the joint torque only.
 _SHAPE_ALONE = 0.7
-# Least probability of a claim without a look-alike.
-_SURE = 0.8
 # Confidence in one of two causes of the same torque in these motions.
 _EITHER = 0.5
 # A change of a length over its standard deviation.
@@ -584,31 +582,6 @@ class State:
         """The candidate of the same torque in these sessions, by the physics of the effect."""
         cause = candidate.effect.same_as(self.dictionary.setting, candidate.joint)
         return next((c for c in self.dictionary.candidates if c.key == (cause, candidate.joint)), None)
-
-
-def look_alikes(
-    gain: float, rivals: Sequence[tuple[Candidate, float]], sure: float
-) -> tuple[tuple[Candidate, float], ...]:
-    """The rivals, best first, that a cause of a gain is not distinguishable from; the best one at least where rivals
-    leave it a probability `sure` below that of a sure claim."""
-    alike = tuple((rival, other) for rival, other in rivals if gain - other < margin(gain))
-    return alike or (tuple(rivals[:1]) if sure < _SURE else ())
-
-
-def margin(gain: float) -> float:
-    """Largest difference of gains between indistinguishable causes."""
-    return 12.0 + 0.1 * gain
-
-
-def confidence(gain: float, rivals: Sequence[float]) -> float:
-    """Probability of the best cause among itself, its rivals and chance.
-
-    Gains are differences of chi-square, up to the misfit of any effect's form, taken as 3 % of the gain.
-    """
-    scale = 2.0 * (1.0 + 0.03 * gain)
-    others = sum(float(np.exp(-max(gain - g, 0.0) / scale)) for g in rivals)
-    chance = float(2.0 * normal_tail(np.sqrt(max(gain, 0.0)))) * 500.0
-    return 1.0 / (1.0 + others + chance)
 
 
 def _width(rows: Rows) -> int:

@@ -8,7 +8,8 @@ import numpy as np
 
 from ident.diagnosis import DiagnosisSettings
 from ident.diagnosis.candidates import Candidate, Trial
-from ident.diagnosis.selection import State, confidence, look_alikes
+from ident.diagnosis.rivals import confidence, look_alikes
+from ident.diagnosis.selection import State
 from ident.diagnosis.signatures import signature_bench
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, Shape
