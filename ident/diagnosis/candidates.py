@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score, chance
 from ident.diagnosis.nominal import Nominal, SideRows
 from ident.diagnosis.recording import sensor_limits
+from ident.diagnosis.rivals import exceeds
 from ident.diagnosis.settings import A_COEFFICIENT
 from ident.effects import DELAYS, EFFECTS, Effect, Setting, Shape
 from ident.rows.data_quality import run_bounds
@@ -313,13 +314,18 @@ class Dictionary:
             return self._contacts(candidate)
         if candidate.effect.step:
             return self._step(candidate)
-        best: Trial | None = None
+        # Shapes that hold others of this candidate, and the others.
+        found: dict[bool, Trial] = {}
         entries = self._prepared(candidate)
         for shape, rows, known in entries:
             score = self.measure(candidate, rows, len(entries), known)
-            better = best is None or _worth(score) > _worth(best.score)
+            general = candidate.key in candidate.effect.special_cases(shape, candidate.joint)
+            better = general not in found or _worth(score) > _worth(found[general].score)
             if better and candidate.effect.plausible(score.coefficients, shape):
-                best = Trial(candidate, shape, score, rows)
+                found[general] = Trial(candidate, shape, score, rows)
+        plain, wide = found.get(False), found.get(True)
+        needed = wide is not None and (plain is None or exceeds(wide.score.gain, plain.score.gain))
+        best = wide if needed else plain
         return None if best is None else self._simplified(best)
 
     def _simplified(self, trial: Trial) -> Trial:

@@ -20,6 +20,11 @@ def margin(gain: float) -> float:
     return 12.0 + 0.1 * gain
 
 
+def exceeds(gain: float, special: float) -> bool:
+    """Whether a cause gains so much more than a special case of it that it is needed."""
+    return gain - special > margin(special)
+
+
 def confidence(gain: float, rivals: Sequence[float]) -> float:
     """Probability of the best cause among itself, its rivals and chance.
 

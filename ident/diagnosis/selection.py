@@ -17,7 +17,7 @@ import numpy as np
 from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence, Floats, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
-from ident.diagnosis.rivals import confidence, look_alikes, margin
+from ident.diagnosis.rivals import confidence, exceeds, look_alikes
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.tolerances import HABIT, HABITUAL, LENGTH, Tolerance, tolerances, usual_change
 from ident.diagnosis.usual_sizes import Healthy
@@ -261,8 +261,12 @@ class State:
         gain = {t.candidate.key: _gain(t) for t in found}
 
         def needed(trial: Trial) -> bool:
-            cases = [(cause, trial.candidate.joint) for cause in trial.candidate.effect.contains]
-            return all(_gain(trial) - gain[case] > margin(gain[case]) for case in cases if case in gain)
+            cases = trial.candidate.effect.special_cases(trial.shape, trial.candidate.joint)
+            return all(
+                exceeds(_gain(trial), gain[case])
+                for case in cases
+                if case in gain and case != trial.candidate.key
+            )
 
         return [t for t in found if needed(t)]
 

@@ -325,6 +325,11 @@ class Effect(ABC):
 
     # ---- torque ----
 
+    def special_cases(self, shape: Shape, joint: int) -> Sequence[tuple[str, int]]:
+        """Causes and joints (from 0) with a special case of this shape's torque, in whose place it has to gain clearly
+        more."""
+        return [(cause, joint) for cause in self.contains]
+
     def least(self, setting: Setting, joint: int) -> Mapping[str, float]:
         """Least shape parameters: below them it is the healthy arm's own, or in no row; default those of the grid."""
         return {}

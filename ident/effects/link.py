@@ -258,6 +258,8 @@ class _Spring(Form):
     TWO_JOINTS = "over two joints", "stiffness", "source", "ratio"
 
 
+# Angle of the second joint over that of the first, in the length of a hose: to begin with, and least.
+_RATIOS, _LEAST_RATIO = (-1.0, 1.0), 0.4
 # Distance in which the friction of a hose along the arm reverses [rad].
 _RUB_RAD = 0.1
 
@@ -283,7 +285,7 @@ class CableSpring(Effect):
         Parameter("slack", "rad", "angle at which the cable becomes taut, or middle of its play", shape=True),
         Parameter("play", "rad", "half the range without a pull", shape=True, low=0.0),
         Parameter("source", "1", "the other joint of a hose over two, from 1", shape=True, fixed=True),
-        Parameter("ratio", "1", "its angle over that of the first", shape=True),
+        Parameter("ratio", "1", "its angle over that of the first", shape=True, low=-2.5, high=2.5),
     )
     forms = _Spring
     depends_on = "position"
@@ -299,11 +301,7 @@ class CableSpring(Effect):
     tell_apart = "the same slow sweep of joint {joint} in two postures of the other joints"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Linear, cubic, hardening and one-sided springs, and springs with play.
-
-        A hose over two joints is not searched for: with a ratio far from one it is a spring at one joint, so it would
-        stand beside each spring of a single joint as a further look-alike.
-        """
+        """Linear, cubic, hardening and one-sided springs, springs with play, and hoses on to the next two joints."""
         low, high = setting.position_range[joint]
         angles = [float(low + share * (high - low)) for share in (0.3, 0.5, 0.7)]
         taut, plays = (
@@ -314,10 +312,23 @@ class CableSpring(Effect):
             *(Shape(form) for form in (_Spring.LINEAR, _Spring.CUBIC, _Spring.HARDENING)),
             *(Shape(form, slack=angle) for form in taut for angle in angles),
             *(Shape(_Spring.PLAY, slack=angle, play=play) for angle in angles for play in plays),
+            *(
+                Shape(_Spring.TWO_JOINTS, source=other + 1, ratio=ratio)
+                for other in range(joint + 1, min(joint + 3, len(setting.position_range)))
+                for ratio in _RATIOS
+            ),
         ]
 
+    def special_cases(self, shape: Shape, joint: int) -> Sequence[tuple[str, int]]:
+        """A hose over two joints with a ratio far from one is a spring at one of them."""
+        both = shape.form is _Spring.TWO_JOINTS
+        return [(self.cause, joint), (self.cause, round(shape["source"]) - 1)] if both else []
+
     def plausible(self, coefficients: Floats, shape: Shape) -> bool:
-        """Whether it pulls back; a hardening one at least in the mean over a radian to both sides."""
+        """Whether it pulls back; a hardening one at least in the mean over a radian to both sides, and one over two
+        joints at both of them."""
+        if shape.form is _Spring.TWO_JOINTS and abs(shape["ratio"]) < _LEAST_RATIO:
+            return False
         if shape.form is _Spring.HARDENING:
             return bool(coefficients[0] + coefficients[2] >= 0.0)
         return bool(coefficients[0] >= 0.0)

@@ -40,6 +40,13 @@ def cable(s: Signals) -> None:
     s["joint"][:, 2] += pull
 
 
+def hose(s: Signals) -> None:
+    pull = 0.3 * (s["q"][:, 1] + 0.8 * s["q"][:, 2])
+    for side in ("motor", "joint"):
+        s[side][:, 1] += pull
+        s[side][:, 2] += 0.8 * pull
+
+
 def sensor_gain(s: Signals) -> None:
     s["joint"][:, 1] *= 1.03
 
@@ -100,6 +107,7 @@ def test_base_model_alone_leaves_only_noise(healthy: Diagnosis) -> None:
         (load_friction, "friction_load", (2,), "factor", 0.03),
         (rough_spot, "friction_position", (2,), "centre", 0.3),
         (cable, "cable_spring", (3,), "stiffness", 0.1),
+        (hose, "cable_spring", (2,), "ratio", 0.8),
         (sensor_gain, "sensor_gain", (2,), "error", 0.03),
         (crosstalk, "sensor_crosstalk", (1,), "factor", 0.02),
         (drift, "sensor_offset_drift", (3,), "drift", 0.1),
