@@ -270,7 +270,8 @@ def _sensor_ripple(s: Setup, v: Variant, p: float) -> Outcome:
 def _late(side: str) -> Change:
     def change(s: Setup, v: Variant, p: float) -> Outcome:
         delay = getattr(s.sensing, side).delay
-        return _channel(s, side, delay=delay + p), {"delay": (delay + p, "s")}
+        # Like a gain, what it is beyond that of the healthy channel.
+        return _channel(s, side, delay=delay + p), {"delay": (p, "s")}
 
     return change
 

@@ -454,6 +454,8 @@ class Dictionary:
                 low, high = max(here - 2.5, _STEP_ROOM_S), min(here + 2.5, last)
             elif effect.event:
                 low, high = (here - 0.3, here + 0.3) if name == "time" else (0.4 * here, 2.0 * here)
+            if limits.away:
+                low, high = (max(low, limits.away), high) if here > 0.0 else (low, min(high, -limits.away))
             least = effect.least(self.setting, max(trial.candidate.joint, 0)).get(name, limits.low)
             low, high = max(low, limits.low, least), min(high, limits.high)
             if low < high:

@@ -75,6 +75,7 @@ class Parameter:
 
     shape : the torque is nonlinear in it. low, high : physically sensible range. share : reported in percent.
     optional : may be left out. fixed : a shape parameter with values on the grid only, such as a whole number.
+    away : least size of one that keeps its sign.
     """
 
     name: str
@@ -86,6 +87,7 @@ class Parameter:
     share: bool = False
     optional: bool = False
     fixed: bool = False
+    away: float = 0.0
 
 
 class Shape(Mapping[str, float]):

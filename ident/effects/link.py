@@ -258,8 +258,8 @@ class _Spring(Form):
     TWO_JOINTS = "over two joints", "stiffness", "source", "ratio"
 
 
-# Angle of the second joint over that of the first, in the length of a hose: to begin with, and least.
-_RATIOS, _LEAST_RATIO = (-1.0, 1.0), 0.4
+# Angle of the second joint over that of the first, in the length of a hose, to begin with.
+_RATIOS = (-1.8, -0.7, 0.7, 1.8)
 # Distance in which the friction of a hose along the arm reverses [rad].
 _RUB_RAD = 0.1
 
@@ -285,7 +285,7 @@ class CableSpring(Effect):
         Parameter("slack", "rad", "angle at which the cable becomes taut, or middle of its play", shape=True),
         Parameter("play", "rad", "half the range without a pull", shape=True, low=0.0),
         Parameter("source", "1", "the other joint of a hose over two, from 1", shape=True, fixed=True),
-        Parameter("ratio", "1", "its angle over that of the first", shape=True, low=-2.5, high=2.5),
+        Parameter("ratio", "1", "its angle over that of the first", shape=True, low=-2.5, high=2.5, away=0.4),
     )
     forms = _Spring
     depends_on = "position"
@@ -325,10 +325,7 @@ class CableSpring(Effect):
         return [(self.cause, joint), (self.cause, round(shape["source"]) - 1)] if both else []
 
     def plausible(self, coefficients: Floats, shape: Shape) -> bool:
-        """Whether it pulls back; a hardening one at least in the mean over a radian to both sides, and one over two
-        joints at both of them."""
-        if shape.form is _Spring.TWO_JOINTS and abs(shape["ratio"]) < _LEAST_RATIO:
-            return False
+        """Whether it pulls back; a hardening one at least in the mean over a radian to both sides."""
         if shape.form is _Spring.HARDENING:
             return bool(coefficients[0] + coefficients[2] >= 0.0)
         return bool(coefficients[0] >= 0.0)
