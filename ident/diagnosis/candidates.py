@@ -494,8 +494,9 @@ def _alike(a: Shape, b: Shape, besides: str) -> bool:
 
 def _neighbours(values: Sequence[float], here: float, *, signed: bool) -> tuple[float, float]:
     """The values next to one, on its own side of zero unless the parameter is `signed`."""
-    below = [v for v in values if v < here * (1 - 1e-9) - 1e-12]
-    above = [v for v in values if v > here * (1 + 1e-9) + 1e-12]
+    rounding = 1e-9 * abs(here) + 1e-12
+    below = [v for v in values if v < here - rounding]
+    above = [v for v in values if v > here + rounding]
     low = below[-1] if below else (0.4 * here if here > 0 else here - 0.5)
     high = above[0] if above else (2.5 * here if here > 0 else here + 0.5)
     if not signed and here > 0.0 and low <= 0.0:
