@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
-from ident.diagnosis.candidates import Candidate, Dictionary, _beside_rest, find_bursts
+from ident.diagnosis.candidates import Candidate, Dictionary, _beside_rest, _neighbours, find_bursts
 from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.signatures import signature_bench
@@ -44,6 +44,13 @@ def test_a_push_longer_than_its_burst_is_tried(make: Callable[..., Session], cha
     assert found is not None
     assert abs(found.shape["time"] - MIDDLE_S) < 0.5
     assert burst.duration_s + 0.3 < found.shape["duration"] < LENGTH_S + 0.5
+
+
+@pytest.mark.parametrize(
+    ("here", "ends"), [(-1.8, (-2.3, -0.7)), (-0.7, (-1.8, 0.7)), (0.7, (-0.7, 1.8)), (1.8, (0.7, 4.5))]
+)
+def test_a_value_is_refined_between_those_beside_it(here: float, ends: tuple[float, float]) -> None:
+    assert _neighbours([-1.8, -0.7, 0.7, 1.8], here, signed=True) == pytest.approx(ends)
 
 
 def test_remembered_products_are_those_of_the_present_columns(
