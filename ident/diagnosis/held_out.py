@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:  # what words about a diagnosis need of this module starts faster
+if TYPE_CHECKING:  # the words about a diagnosis need a constant of this module, and no search
     from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
 
 _DRAWS = 1000
