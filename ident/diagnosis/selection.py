@@ -478,8 +478,8 @@ class State:
     def merged(self, accepted: list[Trial]) -> list[Trial]:
         """Without special cases that a cause containing them, fitted in their stead, leaves nothing to explain of."""
         for general in accepted:
-            cases = [(cause, general.candidate.joint) for cause in general.candidate.effect.contains]
-            for special in (t for t in accepted if t.candidate.key in cases):
+            cases = general.candidate.effect.special_cases(general.shape, general.candidate.joint)
+            for special in (t for t in accepted if t is not general and t.candidate.key in cases):
                 rest = [t for t in accepted if t is not general and t is not special]
                 self.tolerate(rest)
                 alone = self.dictionary.best(general.candidate)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 
 from ident.diagnosis import DiagnosisSettings
 from ident.diagnosis.candidates import Candidate, Trial
@@ -35,6 +36,30 @@ def test_two_causes_in_the_same_rows_do_not_compete(make: Callable[..., Session]
     ripple = trial("gear_ripple", cycles_per_turn=12.0, gear_ratio=1.0)
     assert ripple.score.gain > here.score.gain > 0.0
     assert state.competing(here, [ripple, other_form], []) == [other_form]
+
+
+@pytest.mark.parametrize(("own", "left"), [(0.0, 1), (3.0, 2)])
+def test_a_hose_leaves_a_spring_at_its_second_joint_only_what_it_does_not_explain(
+    make: Callable[..., Session], chain: Chain, own: float, left: int
+) -> None:
+    def hose(s: dict[str, np.ndarray]) -> None:
+        pull = 4.0 * (s["q"][:, 1] + 1.1 * s["q"][:, 2])
+        for side in ("motor", "joint"):
+            s[side][:, 1] += pull
+            s[side][:, 2] += 1.1 * pull + own * s["q"][:, 2] ** 3
+
+    bench = signature_bench([make("a.mcap", 1, hose), make("b.mcap", 2, hose, 1)], chain)
+    state = State(bench.dictionary, bench.evidence, DiagnosisSettings())
+    state.tolerate([])
+    spring = Candidate(EFFECTS["cable_spring"], 2)
+    alone = bench.dictionary.best(spring)
+    assert alone is not None
+    state.tolerate([alone])
+    both = bench.dictionary.best(Candidate(EFFECTS["cable_spring"], 1))
+    assert both is not None
+    assert both.shape.form_name == "over two joints"
+    kept = state.merged([alone, both])
+    assert [t.candidate.joint for t in kept] == [2, 1][-left:]
 
 
 def test_best_shapes_are_found_once_beside_the_same_columns_and_anew_beside_others(
