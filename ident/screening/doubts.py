@@ -14,6 +14,10 @@ LATE_S = 0.01
 MOVED = 0.05
 """Least movement of a joint of interest [rad or m]."""
 MEND_TIME = "shift the column by that time before the import, or record it with the stamps of its own samples"
+MEND_POSITION = (
+    "check zero and gain of this channel (`offset_rad` and `scale` in the mapping of the import) and the joint's frame "
+    "in the URDF"
+)
 
 
 @dataclass(frozen=True)

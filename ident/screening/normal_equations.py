@@ -19,6 +19,8 @@ Part = tuple[int, int]
 
 FLOOR = 0.01
 """A residual below this share of the torque is as good as none: the accuracy of torque sensors."""
+DEVIATIONS = 5.0
+"""An error of less standard deviations may be chance."""
 ROUNDS = 8
 """Rounds of reweighting, at most."""
 BLOCK = 10

@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 
 from ident.dynamics.parameters import Floats
-from ident.screening.normal_equations import Class, Fit, Normal, Part, factored
+from ident.screening.normal_equations import DEVIATIONS, Class, Fit, Normal, Part, factored
 from ident.screening.redundancy import Redundancy, SampledRows, Size
 
-GAIN, DEVIATIONS = 0.18, 5.0
-"""Least error of a gain of interest, and in its standard deviations: sensors are calibrated to a few per cent."""
+GAIN = 0.18
+"""Least error of a gain of interest: sensors are calibrated to a few per cent."""
 LEFT = 0.75
 """Largest share of the residual left by a true error."""
 # Share of a class's squared residual that an error of one part explains, and size of a zero or a drift over the rms of

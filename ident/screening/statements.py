@@ -1,0 +1,122 @@
+"""What explains a contradiction between the channels of sessions, said as a doubt with what to check."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ident.rows.sessions import payload_name
+from ident.screening.doubts import MEND_POSITION, Doubt
+from ident.screening.explanations import CERTAIN, Explanation
+from ident.screening.normal_equations import Part
+from lwr_driver.session import Session
+
+# Gains beyond a factor of two, and reversed signs, are no calibration; undone, they leave this share of the residual.
+_FACTOR, _LEFT = 2.0, 0.6
+
+
+def doubt_of(one: Explanation, sessions: Sequence[Session]) -> Doubt:
+    """What an explanation says of which channel, and what to check."""
+    names = sessions[0].joint_names
+    joints = tuple(names[joint] for joint in one.joints)
+    channel, session, looks_like = one.channel, "", one.looks_like
+    certain = one.drop > CERTAIN
+    fall = better(one.drop)
+    if one.gain is not None:
+        seen = f"is {one.factor:.4g} times the torque computed from all other channels"
+        if len(joints) == 1:
+            seen = f"is {one.gain.value:.4g} ± {one.gain.std:.2g} times the torque computed from all other channels"
+        if one.alike:
+            either = {names[each.joints[0]]: each.factor for each in (one, *one.alike)}
+            listed = " or ".join(f"{joint} is {factor:.4g} times" for joint, factor in either.items())
+            joints, looks_like = tuple(either), "a gain of one of them"
+            seen = (
+                f"{listed} the torque computed from all other channels; both fit alike, the first is likelier"
+            )
+        strange = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
+        certain = strange and one.gain.left < _LEFT
+        check = (
+            "the sign of this channel and of the joint's position"
+            if one.factor < 0.0 and len(one.mended.sides) == 1
+            else "sign, unit and gain of this channel"
+        )
+        mend = f"check {check}; `scale` in the mapping of the import mends a known factor"
+    elif one.parts and channel == "position":
+        session = sessions[one.parts[0][0]].path.name
+        seen = f"contradicts the torques and the other sessions; {fall}"
+        looks_like += opposite(one.parts, sessions)
+        mend = MEND_POSITION
+    elif one.parts:
+        session, seen, certain = _of_part(one, sessions)
+        mend = "check this channel there; the mapping of its import mends a known factor (`scale`) or order of columns"
+        if one.error is not None and one.error.kind == "drift":
+            mend = "leave the session out, or record it with warm electronics"
+    elif channel == "payload" and one.alike:
+        files = [sessions[int(each.label)].path.name for each in (one, *one.alike)]
+        stated = payload_name(sessions[int(one.label)]) or "none"
+        seen = f"one of {', '.join(sorted(files))} carries another payload than its label {stated!r} says; {fall}"
+        options = " or ".join(f"`--payload {file}=NAME`" for file in sorted(files))
+        mend = f"name what is mounted in the one with the wrong label ({options}; `none`: the bare arm)"
+        return Doubt(channel, joints, seen, "", mend, certain)
+    elif channel == "payload":
+        session = sessions[int(one.label)].path.name
+        stated = payload_name(sessions[int(one.label)]) or "none"
+        seen = f"the torques contradict the label {stated!r}; {fall}"
+        mend = f"name the mounted payload (`--payload {session}=NAME`, `none`: the bare arm)"
+    elif channel == "mounting":
+        seen = f"the torques contradict gravity down the URDF's z axis; {fall}"
+        mend = "add a root link with its z axis up to the URDF, and a fixed joint from it to the base"
+    elif channel == "time":
+        seen = f"accelerations and gravity contradict each other; {fall}"
+        mend = "check the sampling rate and the unit of time of the log"
+    elif one.factor == 1.0:
+        seen = f"contradicts the other channels; {fall}"
+        mend = "check the order of the columns of this channel, and its zero positions"
+    else:
+        seen = f"contradicts the other channels; {fall}"
+        mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
+    return Doubt(channel, joints, seen, looks_like, mend, certain, session)
+
+
+def _of_part(one: Explanation, sessions: Sequence[Session]) -> tuple[str, str, bool]:
+    """Session with its half, what was seen, and whether the data are worthless with it, for an error of some parts."""
+    record, half = one.parts[0]
+    session = sessions[record].path.name
+    if len(one.parts) == 1:
+        session += f", {('first', 'second')[half]} half"
+    elif {other for other, _ in one.parts} != {record}:
+        session = "all sessions"
+    rest = "the torque computed from all other channels and the rest of the data"
+    if one.error is None:
+        seen = f"contradicts {rest}" if len(one.joints) > 1 else f"is about {one.factor:g} times {rest}"
+        return session, seen, len(one.joints) == 1 or one.drop > CERTAIN
+    value, std = one.error.value, one.error.std
+    if one.error.kind == "drift":
+        way = "rises" if value > 0.0 else "falls"
+        return session, f"{way} by {abs(value):.3g} ± {std:.2g} Nm from start to end against {rest}", False
+    if one.error.kind == "zero":
+        more = "higher" if value > 0.0 else "lower"
+        either = ", or the other session's" if _is_either(one.parts, sessions) else ""
+        return (
+            session,
+            f"is {abs(value):.3g} ± {std:.2g} Nm {more} than {rest} (its zero is wrong{either})",
+            False,
+        )
+    gross = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
+    return session, f"is {value:.4g} ± {std:.2g} times {rest}", gross and one.error.left < _LEFT
+
+
+def better(drop: float) -> str:
+    """How much better all channels agree by a fall of the score."""
+    return f"the residuals of all torques together fall by a factor of {np.exp(drop):.3g} with it undone"
+
+
+def _is_either(parts: Sequence[Part], sessions: Sequence[Session]) -> bool:
+    """Whether the parts are one whole session of two: with different zeros either may have the wrong one."""
+    return len({half for _, half in parts}) == len(parts) == len(sessions) == 2
+
+
+def opposite(parts: Sequence[Part], sessions: Sequence[Session]) -> str:
+    """What may have happened instead where the parts are one of two sessions; "" otherwise."""
+    return ", or the opposite one in the other session" if _is_either(parts, sessions) else ""
