@@ -6,12 +6,9 @@ import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import special
 
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import (
@@ -27,18 +24,15 @@ from ident.diagnosis.bench import (
 from ident.diagnosis.broken_data import broken_channels, refuse, without_broken
 from ident.diagnosis.channel_delays import CHANNELS, channel_delays, common_delays, mean_of
 from ident.diagnosis.character import character
-from ident.diagnosis.evidence import Evidence, Floats, Rows
+from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std, habit, largest_left
+from ident.diagnosis.evidence import Floats, Rows
 from ident.diagnosis.held_out import held_out
-from ident.diagnosis.nominal import Nominal
-from ident.diagnosis.nominal_arm import GAIN_STD, NominalArm
+from ident.diagnosis.nominal_arm import NominalArm
+from ident.diagnosis.presliding import SlowTurns, presliding_length, slow_turns, with_far_presliding
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.recording import SessionRecord, record, settled
 from ident.diagnosis.reference import (
-    DELAY_STD_S,
-    USUAL_CHANGES,
-    USUAL_DAYS,
     Reference,
-    habit,
     shared,
     unsure,
 )
@@ -48,7 +42,6 @@ from ident.diagnosis.tolerances import gain_rows
 from ident.diagnosis.usual_sizes import scores, usual_sizes
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
-from ident.effects.motion import dahl
 from ident.estimation.turning import drive_coulomb
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
@@ -60,12 +53,6 @@ log = logging.getLogger(__name__)
 
 Side = Literal["link", "motor"]
 
-# Initial presliding lengths [rad], and least fall of the misfit over the noise.
-_GRID = np.geomspace(2e-5, 1e-2, 10)
-_SURE = 30.0
-# Longer distances to try, over the presliding length; least slow friction over its own standard error.
-_LONGER = (4.0, 12.0, 36.0)
-_CLEAR = 3.0
 # Rounds of settling the channels' delays.
 _SETTLING = 2
 _TUNING_SETS = 3
@@ -73,115 +60,6 @@ _ROUNDS = 3
 _LATEST_S = 0.02
 # Share of the factor of a stated stiffness within which a fit is at its end.
 _END = 1.05
-# Share of healthy sets with a row above the largest error of the healthy ones.
-_ABOVE = 0.05
-
-SlowTurns = NDArray[np.float64]
-"""(2, longer distances, n): slowly reversing Coulomb friction [Nm], and its standard deviation."""
-
-
-def presliding_length(nominal: Nominal, values: Floats) -> Floats:
-    """Presliding length (n,) [rad] of Dahl's friction with the best fit to the motor rows, 0 if a sign fits as well.
-
-    values : base parameters (p,). For each joint by itself, their residual is fitted with the drive's own
-    acceleration, speed and offset, and Coulomb friction with each length in turn.
-    """
-    from scipy.optimize import minimize_scalar  # on use: its import is slow
-
-    n = nominal.arm.chain.n
-    lengths = np.zeros(n)
-    if "motor" not in nominal.rows:
-        return lengths
-    rows, motions = nominal.rows["motor"], nominal.motions
-    acceleration = nominal.reduce("motor", [m.motor_acceleration for m in motions])
-    speed = nominal.reduce("motor", [m.motor_speed for m in motions])
-    predicted = np.einsum("jmp,p->mj", rows.matrix, values)
-    before = nominal.reduce("motor", [m.direction for m in motions])
-    for joint in range(n):
-        keep = rows.valid[:, joint] & ~rows.test
-        coulomb = float(motions[0].motor_coulomb[joint])
-        if keep.sum() < 200:
-            continue
-        target = (rows.target - predicted)[:, joint] + coulomb * before[:, joint]
-        plain = np.column_stack([acceleration[:, joint], speed[:, joint], np.ones(len(speed))])
-        # Noise from neighbouring rows, against an overfit.
-        difference = np.diff(target[keep])
-        noise = float(np.quantile(np.abs(difference - np.median(difference)), 0.68) ** 2 / 2.0)
-        misfit = partial(_misfit, nominal, joint, keep, plain, target)
-        errors = [misfit(float(np.log(length))) for length in _GRID]
-        best = int(np.argmin(errors))
-        low, high = np.log(_GRID[max(best - 1, 0)]), np.log(_GRID[min(best + 1, len(_GRID) - 1)])
-        found = minimize_scalar(misfit, bounds=(low, high), method="bounded", options={"maxiter": 8})
-        if misfit(None) - float(found.fun) > _SURE * noise:
-            lengths[joint] = float(np.exp(found.x))
-    return lengths
-
-
-def _misfit(
-    nominal: Nominal,
-    joint: int,
-    keep: NDArray[np.bool_],
-    plain: Floats,
-    target: Floats,
-    logarithm: float | None,
-) -> float:
-    """Sum of squares [Nm^2] with the logarithm of a presliding length, None for a sign."""
-    state = []
-    for m in nominal.motions:
-        v = m.motor_speed[:, joint]
-        if logarithm is None:
-            state.append(np.sign(v))
-        else:
-            path = np.ascontiguousarray(np.cumsum(v) * m.dt)
-            state.append(dahl(path, float(np.exp(logarithm)), float(np.sign(v[0]))))
-    table = np.column_stack([plain, nominal.reduce("motor", state)])[keep]
-    rest = target[keep] - table @ np.linalg.lstsq(table, target[keep], rcond=None)[0]
-    return float(rest @ rest)
-
-
-def slow_turns(nominal: Nominal, evidence: Evidence) -> SlowTurns:
-    """Coulomb friction (2, distances, n) with reversal within each of the longer distances, and its standard
-    deviation, beside the present columns of the evidence; zero and infinite if unknown.
-    """
-    n = nominal.arm.chain.n
-    found = np.zeros((2, len(_LONGER), n))
-    found[1] = np.inf
-    lengths = nominal.arm.presliding
-    if lengths is None or "motor" not in nominal.rows:
-        return found
-    for joint in np.flatnonzero((lengths > 0.0) & nominal.moving):
-        for k, longer in enumerate(_LONGER):
-            signals = []
-            for m in nominal.motions:
-                path = np.ascontiguousarray(np.cumsum(m.motor_speed[:, joint]) * m.dt)
-                state = dahl(path, longer * float(lengths[joint]), float(np.sign(m.motor_speed[0, joint])))
-                signals.append(state - m.direction[:, joint])
-            rows = {("motor", int(joint)): nominal.reduce("motor", signals)[:, None]}
-            score = evidence.score(evidence.padded(rows))
-            if np.isfinite(score.gain):
-                found[:, k, joint] = score.coefficients[0], np.sqrt(score.covariance[0, 0])
-    return found
-
-
-def with_far_presliding(arm: NominalArm, days: Sequence[SlowTurns], coulomb: Sequence[Floats]) -> NominalArm:
-    """The arm with a share of friction with reversal within a longer distance, if several healthy sets agree on one:
-    the mean of the sets is large against its standard error from their scatter.
-
-    coulomb : (n,) of each set [Nm].
-    """
-    if arm.presliding is None or len(days) < 3:
-        return arm
-    table = np.array(days)
-    weight = 1.0 / table[:, 1] ** 2
-    total = np.maximum(weight.sum(axis=0), 1e-300)
-    mean = np.sum(weight * table[:, 0], axis=0) / total
-    error = np.maximum(np.std(table[:, 0], axis=0, ddof=1) / np.sqrt(len(days)), total**-0.5)
-    clear = np.where(np.isfinite(weight).all(axis=0) & (mean > _CLEAR * error), mean**2 * total, 0.0)
-    best = np.argmax(clear, axis=0)
-    joints = np.arange(len(best))
-    level = np.maximum(np.mean(coulomb, axis=0), 1e-9)
-    share = np.where(clear[best, joints] > 0.0, mean[best, joints] / level, 0.0)
-    return replace(arm, far=np.array(_LONGER)[best] * arm.presliding, far_share=np.minimum(share, 0.5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,7 +187,7 @@ def commission(
         shown=shown,
         usual=usual_sizes(tables),
         compliance_std=known.compliance_std,
-        left=_largest_left(left),
+        left=largest_left(left),
     )
 
 
@@ -454,23 +332,6 @@ def _left(
     return held_out(bench.evidence, nuisance).rms()
 
 
-def _largest_left(sets: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
-    """Largest rms (n,) by side that a further healthy set leaves: all its rows stay below in 19 of 20; of a single set
-    its own.
-
-    The logarithms scatter about the mean of their row, alike in all rows: two sets tell too little of one row alone.
-    """
-    logs = {side: np.log([one[side] for one in sets]) for side in sets[0]}
-    away = np.concatenate([(rows - rows.mean(axis=0)).ravel() for rows in logs.values()])
-    found = int(np.isfinite(away).sum())
-    rows, freedom = found // len(sets), found * (1.0 - 1.0 / len(sets))
-    if freedom < 1.0:
-        return dict(sets[0])
-    spread = np.sqrt(np.nansum(away**2) / freedom * (1.0 + 1.0 / len(sets)))
-    more = float(special.stdtrit(freedom, 1.0 - _ABOVE / rows)) * spread
-    return {side: np.exp(values.mean(axis=0) + more) for side, values in logs.items()}
-
-
 def _gains(bench: DiagnosisBench, nuisance: Sequence[Rows]) -> Floats:
     """Errors (2, n) of the torque sensors' gains with standard deviations, beside tolerated deviations; NaN without
     both torques.
@@ -566,46 +427,6 @@ def _known(day: _Day, usual: _Day) -> tuple[Floats, Floats]:
     values[pairs[:, 1]] = day.values[pairs[:, 0]]
     covariance[np.ix_(pairs[:, 1], pairs[:, 1])] = day.covariance[np.ix_(pairs[:, 0], pairs[:, 0])]
     return values, covariance
-
-
-def compliance_std(sets: Sequence[Floats]) -> Floats | None:
-    """Standard error (n,) [rad/Nm] of the mean of the compliances (n,) of healthy sets, None for a single set."""
-    if len(sets) < 2:
-        return None
-    return np.asarray(np.std(sets, axis=0, ddof=1) / np.sqrt(len(sets)))
-
-
-def delay_std(late: Sequence[tuple[float, float]]) -> float:
-    """Standard deviation [s] of a healthy channel's delay on a further day around the mean of these, from values with
-    standard deviations.
-
-    The scatter of a few days is uncertain, so the usual one counts as further days.
-    """
-    values, deviations = np.array(late).T
-    own = float(np.sum((values - values.mean()) ** 2 - (1.0 - 1.0 / len(values)) * deviations**2))
-    days = len(values) - 1
-    variance = (USUAL_DAYS * DELAY_STD_S**2 + max(own, 0.0)) / (USUAL_DAYS + days)
-    return float(np.sqrt(variance * (1.0 + 1.0 / len(values))))
-
-
-def gain_std(days: Sequence[Floats]) -> float:
-    """Standard deviation of the torque sensors' gains from day to day, from errors with standard deviations (2, n) of
-    each. All sensors of an arm have the same habits, and the usual one counts as some further changes.
-    """
-    table = np.array(days)
-    values, own = table[:, 0], table[:, 1] ** 2
-    known = np.isfinite(values) & (own < GAIN_STD**2)
-    count = known.sum(axis=0)
-    several = count > 1
-    if not several.any():
-        return GAIN_STD
-    values, own = (np.where(known, x, np.nan)[:, several] for x in (values, own))
-    changes = count[several] - 1
-    scatter = np.nansum((values - np.nanmean(values, axis=0)) ** 2, axis=0) - changes * np.nanmean(
-        own, axis=0
-    )
-    total = USUAL_CHANGES * GAIN_STD**2 + max(float(scatter.sum()), 0.0)
-    return float(np.sqrt(total / (USUAL_CHANGES + changes.sum())))
 
 
 def _sound(matrix: Floats) -> Floats:

@@ -38,20 +38,16 @@ USUAL_DAYS = 4
 """Weight of the usual deviation of a delay, in days."""
 USUAL_CHANGES = 2.0
 """Weight of the usual change of a parameter, a gain or the size of an effect beside this arm's own, in changes."""
+USUAL = {"Fvl": 0.087, "Fcl": 0.058, "Fvm": 0.087, "Fcm": 0.058}
+"""Usual relative standard deviation of a healthy arm's parameters from day to day, by symbol: Coulomb friction within
+10 % and viscous friction within 15 %, evenly."""
+ELSE = 0.01
+"""The same of all others: gains of the sensors by a per cent."""
 LAST_BODY = ("M", "MX", "MY", "MZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
 """Inertial parameters of a body on the last link: those that are told first."""
 
 _KEY = "commissioning"
 _WIDER = 1.5
-# Usual relative standard deviation of a healthy arm's parameters from day to day: Coulomb friction within 10 % and
-# viscous friction within 15 %, evenly; gains of the sensors by a per cent.
-_USUAL = {"Fvl": 0.087, "Fcl": 0.058, "Fvm": 0.087, "Fcm": 0.058}
-_ELSE = 0.01
-# Offsets have no size of their own: share of the rms torque in their rows.
-_OFFSETS = ("offl", "offm")
-# Weight of the scatter of a symbol beside that of a parameter, and of the expected scatter beside the symbol's, in
-# changes.
-_ALIKE = 4.0
 # Relative error within which a stiffness counts as known.
 _STIFFNESS_WITHIN = 0.2
 _ONE_IN = 0.01
@@ -308,7 +304,7 @@ class Reference:
         here, there = np.array([b for _, b in pairs]), np.array([a for a, _ in pairs])
         covariance = own.covariance[np.ix_(there, there)] * wider**2
         values = own.values[there]
-        usual = np.array([_USUAL.get(symbol_of(base.names[b]), _ELSE) for b in here])
+        usual = np.array([USUAL.get(symbol_of(base.names[b]), ELSE) for b in here])
         tolerance = np.zeros(len(here)) if self.habits else usual * np.abs(values)
         std = np.sqrt(np.diag(covariance))
         covariance = covariance + np.diag(tolerance**2 + (0.05 * std) ** 2)
@@ -327,78 +323,6 @@ def unsure(compliance: Floats, std: Floats | None) -> NDArray[np.bool_]:
     if std is None:
         return np.zeros(len(compliance), dtype=bool)
     return np.asarray(2.0 * std > _STIFFNESS_WITHIN * compliance)
-
-
-def habit(
-    names: Sequence[str],
-    days: Sequence[Floats],
-    covariances: Sequence[Floats],
-    torque_rms: Mapping[str, Floats],
-    efforts: Floats | None = None,
-    sizes: Floats | None = None,
-) -> Floats:
-    """Variance (p,) of healthy parameters from day to day around their mean.
-
-    days, covariances : parameters (p,) and covariance (p, p) of each day, NaN for the parameters of another payload.
-    torque_rms : of the rows by side, (n,) [Nm]. efforts : (n,) largest torques [Nm]; a sensor's zero may go with its
-        range and not with the torque of a motion. sizes : (p,) of which the changes are shares, default the mean: the
-        friction of a law of several columns changes as a whole.
-    Joints of an arm have the same habits, so all parameters of a symbol share one relative variance: the scatter of the
-    days beyond their own uncertainty, and the usual change as some further changes. Two days of a 7-joint arm are
-    seven changes of its Coulomb friction. What the model lacks bends the parameters differently with each motion, those
-    of small value too: where they scatter by more than that, their variance grows with their uncertainty, by a factor
-    shared by the symbol and refined for each parameter by its own days.
-    """
-    values = np.array(days)
-    count = np.isfinite(values).sum(axis=0)
-    mean, own = np.nanmean(values, axis=0), np.nanmean([np.diag(c) for c in covariances], axis=0)
-    of = mean if sizes is None else sizes
-    symbols = [symbol_of(name) for name in names]
-    # With motor torques alone their rows show the offsets of the links' friction.
-    sides = {"offm": "motor", "offl": "joint" if "joint" in torque_rms else "motor"}
-    scale = np.array(
-        [
-            float(torque_rms[sides[symbol]][joint_of(name)]) if symbol in _OFFSETS else abs(value)
-            for name, symbol, value in zip(names, symbols, of, strict=True)
-        ]
-    )
-    usual = np.array([_USUAL.get(symbol, _ELSE) for symbol in symbols])
-    groups = [symbol if symbol in (*_USUAL, *_OFFSETS, "Ia") else "" for symbol in symbols]
-    squares, variance = np.nansum((values - mean) ** 2, axis=0), np.zeros(len(names))
-    for group in dict.fromkeys(groups):
-        mine = np.array([g == group for g in groups])
-        # A parameter less certain than its usual change tells nothing of habits.
-        telling = mine & (own < (usual * scale) ** 2) & (scale > 0.0)
-        changes = int(np.sum(count[telling] - 1))
-        scatter = squares[telling] - (count[telling] - 1) * own[telling]
-        total = max(float(np.sum(scatter / scale[telling] ** 2)), 0.0)
-        share = (USUAL_CHANGES * usual[mine][0] ** 2 + total) / (USUAL_CHANGES + changes)
-        variance[mine] = share * scale[mine] ** 2
-        if group in _OFFSETS and efforts is not None:
-            ranges = efforts[[joint_of(name) for name, at in zip(names, mine, strict=True) if at]]
-            beyond = squares[mine] - (count[mine] - 1) * own[mine]
-            if of_ranges := _share_of_ranges(beyond, scale[mine], ranges):
-                by_range = of_ranges / int(np.sum(count[mine] - 1)) * ranges**2
-                least = USUAL_CHANGES * usual[mine] ** 2 / (USUAL_CHANGES + changes) * scale[mine] ** 2
-                variance[mine] = np.maximum(by_range, least)
-        expected = own[mine] + variance[mine]
-        excess = squares[mine] / np.maximum(expected, 1e-300)
-        common = max((_ALIKE + excess.sum()) / (_ALIKE + np.sum(count[mine] - 1)), 1.0)
-        each = (_ALIKE * common + excess) / (_ALIKE + count[mine] - 1)
-        variance[mine] += np.maximum(each - 1.0, 0.0) * own[mine]
-    return variance
-
-
-def _share_of_ranges(beyond: Floats, scale: Floats, ranges: Floats) -> float:
-    """Scatter (k,) of offsets beyond their uncertainty, summed in shares of the sensors' ranges (k,); 0 if shares of
-    the torques `scale` (k,) are more likely."""
-    if np.min(scale) <= 0.0:
-        return 0.0
-    of_ranges, of_torques = (float(np.sum(beyond / sizes**2)) for sizes in (ranges, scale))
-    if min(of_ranges, of_torques) <= 0.0:
-        return 0.0
-    likelier = np.sum(np.log(of_ranges * ranges**2)) < np.sum(np.log(of_torques * scale**2))
-    return of_ranges if likelier else 0.0
 
 
 def last_body(base: BaseSet) -> Floats:

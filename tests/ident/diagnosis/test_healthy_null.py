@@ -11,15 +11,11 @@ import pytest
 from ident.diagnosis import bench, channel_delays
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.channel_delays import common_delays
-from ident.diagnosis.commission import (
-    as_stated,
-    compliance_std,
-    delay_std,
-    gain_std,
-    with_far_presliding,
-)
+from ident.diagnosis.commission import as_stated
+from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std
 from ident.diagnosis.evidence import Score
 from ident.diagnosis.nominal_arm import GAIN_STD, NominalArm
+from ident.diagnosis.presliding import with_far_presliding
 from ident.diagnosis.reference import DELAY_STD_S, Reference
 from ident.diagnosis.selection import State
 from ident.diagnosis.settings import DiagnosisSettings

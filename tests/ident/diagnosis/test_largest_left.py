@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.diagnosis.commission import _largest_left
+from ident.diagnosis.day_spread import largest_left
 
 
 def test_a_further_healthy_day_stays_below_in_19_of_20() -> None:
@@ -15,12 +15,12 @@ def test_a_further_healthy_day_stays_below_in_19_of_20() -> None:
         *days, further = (
             {side: rows * np.exp(0.4 * rng.normal(size=3)) for side, rows in level.items()} for _ in range(3)
         )
-        limit = _largest_left(days)
+        limit = largest_left(days)
         assert np.isnan(limit["joint"][2])
         within += all(np.all(~(further[side] > limit[side])) for side in limit)
     assert 365 <= within <= 392
 
 
 def test_a_single_day_is_its_own_limit() -> None:
-    found = _largest_left([{"motor": np.array([2.0, 0.5])}])
+    found = largest_left([{"motor": np.array([2.0, 0.5])}])
     np.testing.assert_array_equal(found["motor"], [2.0, 0.5])

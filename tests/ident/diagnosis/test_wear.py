@@ -10,7 +10,8 @@ import pytest
 from scipy.signal import lfilter
 
 from ident.diagnosis import Diagnosis, Reference, commission, diagnose
-from ident.diagnosis.reference import INERTIA_BY_PHASE, habit
+from ident.diagnosis.day_spread import habit
+from ident.diagnosis.reference import INERTIA_BY_PHASE
 from ident.dynamics.kinematics import Chain
 from lwr_driver.session import Session
 
