@@ -174,7 +174,8 @@ class Disagreement:
         z = (vectors.T @ root.T @ score)[told] / spread
         slope = (vectors.T @ root.T @ information @ (prior.mean[known] * size))[told] / spread
         power = float(slope @ slope)
-        common = (1.0 + float(slope @ z) / power, power**-0.5) if power > 0.0 else (1.0, np.inf)
+        # Bodies whose double the rows would not tell give no factor.
+        common = (1.0 + float(slope @ z) / power, power**-0.5) if power > 1.0 else (1.0, np.inf)
         alone = np.linalg.inv(information + 1e-6 * precision)
         std = np.sqrt(np.diag(alone))
         before = np.sqrt(np.diag(root @ root.T))

@@ -73,6 +73,23 @@ def comment(model: StandardModel, notes: tuple[str, ...]) -> str:
     return "\n     ".join(rows).replace("--", "- -") + " "
 
 
+def drives_left_out(model: StandardModel, file: str) -> str:
+    """Note on a URDF of the model: its drives have inertia, for which the format has no place; "" without."""
+    inertia = model.drive[:, 0]
+    if not np.any(inertia > 0.0):
+        return ""
+    chain = model.chain
+    listed = ", ".join(
+        f"{name} {value:.3g} {parameters.unit('Ia1', prismatic=slides)}"
+        for name, value, slides in zip(chain.joint_names, inertia, chain.prismatic, strict=True)
+        if value > 0.0
+    )
+    return (
+        f"{file} has the bodies without the drives, for which a URDF has no place: give their inertia to the simulator "
+        f"as armature ({listed}), or export an MJCF file, which holds it."
+    )
+
+
 def document(root: ElementTree.Element) -> str:
     """The XML document, indented."""
     ElementTree.indent(root, "  ")

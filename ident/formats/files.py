@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fri.errors import ConfigurationError
 from ident.formats.code import Program, to_c, to_numpy
-from ident.formats.description import to_mjcf, to_urdf
+from ident.formats.description import drives_left_out, to_mjcf, to_urdf
 from ident.formats.read_back import check_c, check_mjcf, check_numpy, check_urdf
 from ident.formats.standard import StandardModel, standard_model
 from ident.model.model_file import Model, as_model, write_checked
@@ -60,6 +60,7 @@ def export(
     if descriptions:
         bodies = standard_model(source, payload=payload, consistent=True)
         notes += bodies.without(bodies.effects, ", ".join(descriptions))
+        notes += [drives_left_out(bodies, path.name) for path in paths if path.suffix == ".urdf"]
     if programs and source.effects:
         program = Program.of(plain)
         carried = replace(source, effects=program.carried)

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
@@ -169,7 +171,10 @@ def consistent_parameters(model: DynamicModel, reference: Floats | None = None) 
     reference : (links + payloads, 10) bodies for the free combinations; default the URDF's, made consistent.
 
     Base parameters eliminated as not essential (value 0) may move by the median standard deviation of the others
-    of their unit. Raises ConfigurationError for a model of torque differences, without bodies.
+    of their unit. Motor torques alone do not tell the inertia of the first drives from that of the links: what the
+    reference bodies leave of their sum is the drives'.
+
+    Raises ConfigurationError for a model of torque differences, without bodies.
     """
     structure, n = model.structure, model.structure.chain.n
     if structure.sides == ("difference",):
@@ -189,10 +194,25 @@ def consistent_parameters(model: DynamicModel, reference: Floats | None = None) 
     if covariance is not None:
         covariance = covariance[np.ix_(rigid, rigid)]
     start = _reference(model, reference)
+    drives = _regrouped_drives(model)
+    told = np.any(matrix[np.ix_(rigid, drives)] != 0.0, axis=1)
+    if told.any():
+        left = (chi - rest - matrix[np.ix_(rigid, inertial)] @ start.ravel())[told]
+        vector[drives] = nnls(matrix[np.ix_(rigid[told], drives)], left)[0]
+        rest = matrix[np.ix_(rigid, others)] @ vector[others]
     found = project(matrix[np.ix_(rigid, inertial)], chi - rest, start, covariance=covariance)
     vector[inertial] = found.bodies.ravel()
     change = np.zeros(n) if found.exact else _torque_change(model, vector)
     return ConsistentParameters(vector, tuple(names[k] for k in rigid), found, change)
+
+
+def _regrouped_drives(model: DynamicModel) -> NDArray[np.int64]:
+    """Columns of the drive inertias that are part of other base parameters."""
+    if model.base is None:
+        return np.zeros(0, dtype=np.int64)
+    structure = model.structure
+    drives = [structure.names.index(f"Ia{k + 1}") for k in range(structure.chain.n)]
+    return np.intersect1d(drives, model.base.dependent)
 
 
 def _base(model: DynamicModel) -> tuple[Floats, Floats, Floats | None, tuple[str, ...]]:

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,8 +14,18 @@ from fri.errors import ConfigurationError
 from ident.dynamics import parameters
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import INERTIAL, PER_LINK
+from ident.dynamics.physical import reference_bodies
 from ident.dynamics.structure import Coulomb, Coupling, ModelStructure
-from ident.formats import Program, consistent_parameters, standard_model, to_mjcf, to_numpy, to_urdf
+from ident.formats import (
+    Program,
+    consistent_parameters,
+    export,
+    standard_model,
+    to_mjcf,
+    to_numpy,
+    to_urdf,
+)
 from ident.model.dynamic_model import DynamicModel
 
 
@@ -89,6 +101,31 @@ def test_urdf_of_a_true_model_reproduces_its_torques(truth_model: DynamicModel) 
         rigid = pin.rnea(reloaded, data, q[row], qd[row], qdd[row])
         joint = rigid + drive["Fvl"] * qd[row] + drive["Fcl"] * np.sign(qd[row]) + drive["offl"]
         np.testing.assert_allclose(joint, truth[row], rtol=0, atol=1e-6)
+
+
+def test_motor_torques_alone_leave_the_drives_what_the_bodies_of_the_urdf_leave(
+    truth_model: DynamicModel, tmp_path: Path
+) -> None:
+    chain = truth_model.structure.chain
+    structure = ModelStructure(chain, 2, sides=("motor",))
+    base = numeric_base(structure)
+    drives = [structure.names.index(f"Ia{k + 1}") for k in range(chain.n)]
+    assert set(drives) & set(base.dependent), "a first drive turns with its link"
+    standard = np.zeros(structure.n_columns)
+    rotors = np.linspace(0.9, 0.3, chain.n)
+    for link, body in enumerate(reference_bodies(chain.urdf_inertials())):
+        standard[len(PER_LINK) * link : len(PER_LINK) * link + len(INERTIAL)] = body
+    standard[drives] = rotors
+    model = DynamicModel("currents", structure, base.names, base.reduce(standard), None, base)
+    np.testing.assert_allclose(standard_model(model, consistent=True).drive[:, 0], rotors, atol=1e-6)
+    done = export(model, tmp_path / "arm.urdf", tmp_path / "arm.xml")
+    assert any(
+        "arm.urdf has the bodies without the drives" in note and "A1 0.9" in note for note in done.notes
+    )
+    armature = [
+        float(one.get("armature", 0)) for one in ElementTree.parse(tmp_path / "arm.xml").iter("joint")
+    ]
+    np.testing.assert_allclose(armature, rotors, atol=1e-6)
 
 
 def test_an_estimate_of_no_real_body_moves_by_its_uncertainty_and_says_so(

@@ -123,6 +123,14 @@ def test_a_factor_on_all_parameters_is_told_from_many_small_differences(factor: 
     assert ("in all bodies alike" in str(found)) == scaled
 
 
+def test_bodies_that_the_rows_hardly_show_give_no_factor() -> None:
+    case = noisy(samples=40)
+    mean = 1e-20 * np.ones(12)
+    found = Disagreement.between(Prior.independent(mean, np.ones(12)), case, np.full(3, 100.0))
+    assert (found.factor, found.factor_std, found.scaled) == (1.0, np.inf, False)
+    assert found.freedom > 0
+
+
 @pytest.mark.parametrize(("left", "told"), [(0.88, False), (0.92, True)])
 def test_a_parameter_with_nine_tenths_of_its_prior_deviation_left_is_from_the_prior(
     left: float, told: bool
