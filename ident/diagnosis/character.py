@@ -21,6 +21,7 @@ from ident.diagnosis.evidence import Floats, chance
 from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import USUAL_CHANGES
+from ident.diagnosis.rivals import likelihood
 from ident.diagnosis.selection import Claim, Selection, State
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import EFFECTS, ELASTICITY, PRESLIDING, Shape, entry_of
@@ -323,6 +324,7 @@ def _entries(sets: Sequence[_Set], chosen: Sequence[tuple[Candidate, Shape]]) ->
     for k, (candidate, shape) in enumerate(chosen):
         each = [fit[k][0] for fit in fits]
         std = np.std(each, axis=0, ddof=1) if len(each) > 1 else np.zeros(len(sizes[k].mean))
+        std = np.hypot(std, _of_shape(sets, table, k) * np.abs(sizes[k].mean))
         found.append(_entry(candidate, shape, sizes[k].mean, std))
         log.info("character: %s", candidate.key)
     return found
@@ -339,6 +341,33 @@ def _fitted(one: _Set, trials: Sequence[Trial]) -> list[tuple[Floats, Floats, bo
         found.append((value, covariance[here, here], part))
         place = here.stop
     return found
+
+
+def _of_shape(sets: Sequence[_Set], table: Sequence[Sequence[Trial]], k: int) -> float:
+    """Standard deviation of the size of effect number k as a share of it, by the shapes of a law of the speed that
+    explain the sets about as well.
+
+    A law of the speed is known where the sets were slow. Where they were not its size follows from its shape, and a
+    slower motion would take the error for a change.
+    """
+    candidate, shape = table[0][k].candidate, table[0][k].shape
+    law = candidate.effect.law
+    if law is None or law.variable != "qd":
+        return 0.0
+    gains, sizes = dict[Shape, float](), dict[Shape, Floats]()
+    for one, trials in zip(sets, table, strict=True):
+        one.state.tolerate([trial for i, trial in enumerate(trials) if i != k])
+        for other in (shape, *candidate.effect.shapes(one.bench.dictionary.setting, candidate.joint)):
+            trial = one.trial(candidate, other) if other.form is shape.form else None
+            if trial is not None:
+                gains[other] = gains.get(other, 0.0) + trial.score.gain
+                sizes[other] = sizes.get(other, 0.0) + trial.score.coefficients / len(sets)
+    if shape not in sizes:
+        return 0.0
+    size, best = sizes[shape], max(gains.values())
+    weights = np.array([likelihood(gains[other], best) for other in sizes])
+    apart = np.array([np.sum((values - size) ** 2) for values in sizes.values()])
+    return float(np.sqrt(weights @ apart / weights.sum()) / np.linalg.norm(size))
 
 
 def _entry(candidate: Candidate, shape: Shape, coefficients: Floats, std: Floats) -> dict[str, Any]:

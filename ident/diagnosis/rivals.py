@@ -25,13 +25,17 @@ def exceeds(gain: float, special: float) -> bool:
     return gain - special > margin(special)
 
 
-def confidence(gain: float, rivals: Sequence[float]) -> float:
-    """Probability of the best cause among itself, its rivals and chance.
+def likelihood(gain: float, best: float) -> float:
+    """Of a cause over that of the best one.
 
     Gains are differences of chi-square, up to the misfit of any effect's form, taken as 3 % of the gain.
     """
-    scale = 2.0 * (1.0 + 0.03 * gain)
-    others = sum(float(np.exp(-max(gain - g, 0.0) / scale)) for g in rivals)
+    return float(np.exp(-max(best - gain, 0.0) / (2.0 * (1.0 + 0.03 * best))))
+
+
+def confidence(gain: float, rivals: Sequence[float]) -> float:
+    """Probability of the best cause among itself, its rivals and chance."""
+    others = sum(likelihood(rival, gain) for rival in rivals)
     chance = float(2.0 * normal_tail(np.sqrt(max(gain, 0.0)))) * 500.0
     return 1.0 / (1.0 + others + chance)
 

@@ -19,9 +19,9 @@ from ident.diagnosis.evidence import Evidence, Floats, Key, Rows, Score
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.rivals import confidence, exceeds, look_alikes
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.diagnosis.tolerances import HABIT, HABITUAL, LENGTH, Tolerance, tolerances, usual_change
+from ident.diagnosis.tolerances import HABIT, HABITUAL, LENGTH, SIZE, Tolerance, tolerances, usual_change
 from ident.diagnosis.usual_sizes import Healthy
-from ident.effects import Shape
+from ident.effects import EFFECTS, Shape
 
 log = logging.getLogger(__name__)
 
@@ -343,6 +343,30 @@ class State:
         self.evidence.replace(present)
         return found
 
+    def _of_own_law(self, trial: Trial) -> bool:
+        """Whether a law of a drive's speed is no larger than the error of the healthy arm's own one: where the healthy
+        sets were not as slow, its size follows from the form alone."""
+        candidate, law = trial.candidate, trial.candidate.effect.law
+        if law is None or law.variable != "qd":
+            return False
+        own = [
+            one
+            for one in self.tolerated()
+            if one.name.startswith(SIZE)
+            and one.of is not None
+            and one.of[1] == candidate.joint
+            and EFFECTS[one.of[0]].law == law
+        ]
+        mine = self.powers(trial, trial.score)
+        return any(
+            all(
+                self._power(key, one.rows[key][:, 0] * one.size) >= mine[key]
+                for key in mine
+                if key in one.rows
+            )
+            for one in own
+        )
+
     def _least(self, candidate: Candidate, score: Score) -> float:
         """Least gain of a claim."""
         return self.settings.least_of_claim(candidate.effect.evidence_factor, len(score.coefficients))
@@ -399,7 +423,7 @@ class State:
         least = self._least(trial.candidate, score)
         if score.gain <= least:
             return False
-        if healthy and (not self.unusual(trial) or self._by_habits(trial)):
+        if healthy and (not self.unusual(trial) or self._by_habits(trial) or self._of_own_law(trial)):
             return False
         if trial.candidate.effect.seen_in_samples(trial.shape):
             return True
@@ -427,12 +451,13 @@ class State:
 
     def powers(self, trial: Trial, score: Score) -> dict[Key, float]:
         """Power of a trial's torque in the rows of each joint and side, in units of the noise."""
-        found = {}
-        for (side, joint), columns in trial.rows.items():
-            used = self.dictionary.nominal.rows[side].valid[:, joint]
-            torque = columns[used] @ score.coefficients / self.evidence.sigma[side][joint]
-            found[side, joint] = float(np.var(torque)) if used.any() else 0.0
-        return found
+        return {key: self._power(key, columns @ score.coefficients) for key, columns in trial.rows.items()}
+
+    def _power(self, key: Key, torque: Floats) -> float:
+        """Power of a torque (m,) in the rows of a side and joint, in units of the noise."""
+        side, joint = key
+        used = self.dictionary.nominal.rows[side].valid[:, joint]
+        return float(np.var(torque[used] / self.evidence.sigma[side][joint])) if used.any() else 0.0
 
     def share_at(self, trial: Trial, joint: int) -> float:
         """Share of a trial's power in the rows of a joint."""

@@ -50,7 +50,8 @@ class Choice(Tabular):
 
     candidates : in the order of preference. chosen : number of the winner. parts, block_s : of the held-back rows.
     excluded : candidates that the data do not permit, with the reason. disagreement : between the URDF's inertials
-    and the data. advice : sentences for the report. mounting : the tilt of the base, if the winner has one.
+    and the data. contradiction : joints whose torques no bodies like the URDF's explain, as a sentence; empty without.
+    advice : sentences for the report. mounting : the tilt of the base, if the winner has one.
     gains : error of the joint torque sensor's scale by joint, value and standard deviation, if the winner has some;
     gains_covariance : (k, k) of theirs.
     urdf_doubt : why the URDF's bodies are missing or look like placeholders, empty without doubt.
@@ -64,6 +65,7 @@ class Choice(Tabular):
     block_s: float
     excluded: tuple[str, ...] = ()
     disagreement: Disagreement | None = None
+    contradiction: str = ""
     advice: tuple[str, ...] = ()
     mounting: Mounting | None = None
     gains: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -96,6 +98,7 @@ class Choice(Tabular):
             ],
             "excluded": list(self.excluded),
             "prior_disagreement": None if self.disagreement is None else self.disagreement.to_dict(),
+            "contradiction": self.contradiction,
             "advice": list(self.advice),
             "urdf_doubt": self.urdf_doubt,
             "mounting": None if self.mounting is None else self.mounting.to_dict(),

@@ -91,7 +91,8 @@ def choose(
     if turning is not None:
         choice, effects = replace(choice, turning=turning), (*effects, *turning.entries)
     apart = choice.disagreement
-    warnings = (*found.warnings, str(apart)) if apart is not None and apart.strong else found.warnings
+    contradiction = str(apart) if apart is not None and apart.strong else choice.contradiction
+    warnings = (*found.warnings, *filter(None, [contradiction]))
     return replace(found, settings=settled, choice=choice, effects=effects, warnings=warnings)
 
 

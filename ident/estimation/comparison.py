@@ -52,6 +52,10 @@ _SURE = 2.0
 _UPRIGHT = 1e-3
 # Errors this close to one another count as equal, and so much of a joint's torque as nothing.
 _ALIKE = 0.01
+# Error of bodies like the URDF's over that of any parameters in a joint, and least share of those joints' excess in
+# the squared error of all, for a contradiction. Bodies of six real arms and light wrists of theirs stay below one or
+# the other.
+_FAR_WORSE, _MOSTLY = 3.0, 0.5
 # Squared error over the squared torque of a candidate that predicts no better than a torque of zero.
 _NOTHING = 1.0
 PLAIN = CovarianceSettings(kind="textbook")
@@ -221,11 +225,13 @@ class EstimatorComparison:
             for k, kind in enumerate(kinds)
         )
         place = kinds.index(chosen)
+        contradiction = self._contradiction(candidates, squares)
         advice += self._worse_joints(candidates, squares, place)
         values, spread = self._gains(chosen)
         readings = zip(chosen[3], values, np.sqrt(np.diag(spread)), strict=True)
         return Choice(
-            candidates, place, len(self.held), self.block_s, excluded, self._disagreement(), tuple(advice),
+            candidates, place, len(self.held), self.block_s, excluded, self._disagreement(), contradiction,
+            tuple(advice),
             gains={self.joints[g]: (float(value), float(std)) for g, value, std in readings},
             gains_covariance=spread,
         )  # fmt: skip
@@ -410,6 +416,34 @@ class EstimatorComparison:
         if self.bodies is None:
             return None
         return Disagreement.between(self._stated, self.problem, self._weights(("physical", 1.0, False, ())))
+
+    def _contradiction(self, candidates: Sequence[Candidate], squares: Floats) -> str:
+        """Joints that bodies within the stated deviations of the URDF's predict far worse than any parameters do, where
+        this is most of the error; empty if there are none. squares : (candidates, parts, classes).
+
+        Each joint's torque may agree with itself and contradict the others: a gain or a zero is then in the parameters
+        of least squares, and no bodies have them.
+        """
+        plain = {(c.estimator, c.prior_scale): k for k, c in enumerate(candidates) if not (c.tilt or c.gains)}
+        stated, free = plain.get(("physical", 1.0)), plain.get(("wls", None))
+        if stated is None or free is None:
+            return ""
+        more = squares[stated] - squares[free]
+        excess, std = _paired(more.T)
+        far = squares[stated].sum(axis=0) > _FAR_WORSE**2 * squares[free].sum(axis=0)
+        far &= excess > _SURE * std
+        if self._share(more * far).sum() <= _MOSTLY * self._share(squares[stated]).sum():
+            return ""
+        listed = ", ".join(
+            f"{c.label} {candidates[stated].by_joint_percent[c.label]:.1f} against "
+            f"{candidates[free].by_joint_percent[c.label]:.1f} %"
+            for c, one in zip(self.problem.classes, far, strict=True)
+            if one
+        )
+        return (
+            f"no bodies like the URDF's explain the torques that least squares explains: error of the held-back data "
+            f"{listed}; check sign, gain and zero of positions and torques from there outward, and the URDF's masses"
+        )
 
     def _worse_joints(self, candidates: Sequence[Candidate], squares: Floats, chosen: int) -> Iterator[str]:
         """Joints that the winner predicts worse than least squares, beyond two standard errors."""
