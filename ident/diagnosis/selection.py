@@ -25,6 +25,8 @@ from ident.effects import EFFECTS, Shape
 
 log = logging.getLogger(__name__)
 
+# Least square of the correlation of two laws of one drive's speed that stand for each other.
+_ALIKE = 0.5
 # Obvious evidence, over the usual one.
 _PLAIN = 10.0
 # Least share of a claim's gain taken away by a rival's columns.
@@ -344,11 +346,12 @@ class State:
         return found
 
     def _of_own_law(self, trial: Trial) -> bool:
-        """Whether a law of a drive's speed is no larger than the error of the healthy arm's own one: where the healthy
-        sets were not as slow, its size follows from the form alone."""
+        """Whether a law of a drive's speed is like the healthy arm's own one, and no larger than the error of that:
+        where the healthy sets were not as slow, its size follows from the form alone."""
         candidate, law = trial.candidate, trial.candidate.effect.law
         if law is None or law.variable != "qd":
             return False
+        key = ("motor", candidate.joint)
         own = [
             one
             for one in self.tolerated()
@@ -356,16 +359,16 @@ class State:
             and one.of is not None
             and one.of[1] == candidate.joint
             and EFFECTS[one.of[0]].law == law
+            and key in one.rows
         ]
-        mine = self.powers(trial, trial.score)
-        return any(
-            all(
-                self._power(key, one.rows[key][:, 0] * one.size) >= mine[key]
-                for key in mine
-                if key in one.rows
-            )
-            for one in own
-        )
+        for one in own:
+            used = self.dictionary.nominal.rows["motor"].valid[:, candidate.joint]
+            torque = (trial.rows[key] @ trial.score.coefficients)[used]
+            largest = one.rows[key][used, 0] * one.size
+            alike = np.corrcoef(torque, largest)[0, 1] ** 2 > _ALIKE
+            if alike and np.var(torque) <= np.var(largest):
+                return True
+        return False
 
     def _least(self, candidate: Candidate, score: Score) -> float:
         """Least gain of a claim."""
@@ -451,13 +454,12 @@ class State:
 
     def powers(self, trial: Trial, score: Score) -> dict[Key, float]:
         """Power of a trial's torque in the rows of each joint and side, in units of the noise."""
-        return {key: self._power(key, columns @ score.coefficients) for key, columns in trial.rows.items()}
-
-    def _power(self, key: Key, torque: Floats) -> float:
-        """Power of a torque (m,) in the rows of a side and joint, in units of the noise."""
-        side, joint = key
-        used = self.dictionary.nominal.rows[side].valid[:, joint]
-        return float(np.var(torque[used] / self.evidence.sigma[side][joint])) if used.any() else 0.0
+        found = {}
+        for (side, joint), columns in trial.rows.items():
+            used = self.dictionary.nominal.rows[side].valid[:, joint]
+            torque = columns[used] @ score.coefficients / self.evidence.sigma[side][joint]
+            found[side, joint] = float(np.var(torque)) if used.any() else 0.0
+        return found
 
     def share_at(self, trial: Trial, joint: int) -> float:
         """Share of a trial's power in the rows of a joint."""

@@ -254,8 +254,8 @@ class FrictionAsymmetry(Effect):
         viscous = Column(motor=np.abs(motion.motor_speed[:, joint]))
         if shape.form is _Asymmetric.VISCOUS:
             return (viscous,)
-        # Of the Coulomb part, as much as has built up since the last reversal.
-        return viscous, Column(motor=motion.direction[:, joint] * np.sign(motion.motor_speed[:, joint]))
+        # Constant at reversals, too: as much as has built up there is a bump, which other causes make as well.
+        return viscous, Column(motor=np.ones_like(motion.time))
 
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """A torque at the motor."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -162,3 +163,24 @@ def test_a_usual_change_of_what_the_healthy_arm_has_is_in_the_models_and_no_find
         assert "The healthy arm has: stribeck (two)." in str(found)
     findings = diagnose(sticky(make, 2, 1.2), chain, reference=reference).findings
     assert [(f.cause, f.joints) for f in findings] == [("stribeck", (2,))]
+
+
+@pytest.mark.parametrize(("known_to", "causes"), [(0.02, ["stribeck"]), (0.5, [])])
+def test_a_law_of_the_speed_within_the_error_of_the_healthy_one_is_no_change(
+    make: Make, chain: Chain, known_to: float, causes: list[str]
+) -> None:
+    reference = commission([sticky(make, 0, 0.4), sticky(make, 1, 0.4)], chain)
+    (entry,) = reference.model.effects
+    amplitude = entry["parameters"]["amplitude"]
+    # Other shapes fit the days about as well, and rise otherwise towards a standstill.
+    assert 0.05 < amplitude["std"] / amplitude["value"] < 0.4
+    parameters = {**entry["parameters"], "amplitude": {**amplitude, "std": known_to * amplitude["value"]}}
+    model = replace(reference.model, effects=({**entry, "parameters": parameters},))
+
+    def more(s: Signals) -> None:
+        v = s["qd"][:, 1]
+        s["motor"][:, 1] += np.sign(v) * (0.4 * np.exp(-np.abs(v) / 0.1) + 0.3 * np.exp(-((v / 0.15) ** 2)))
+
+    day = [make("a.mcap", 31, more), make("b.mcap", 32, more, 1)]
+    found = diagnose(day, chain, reference=replace(reference, model=model))
+    assert [f.cause for f in found.findings] == causes

@@ -97,6 +97,12 @@ def test_a_hose_over_two_joints_has_a_potential() -> None:
     assert not np.any(joint[:, 0])
 
 
+def test_other_friction_each_way_is_the_offset_of_a_simulated_drive_at_reversals_too() -> None:
+    asymmetry, here = EFFECTS["friction_asymmetry"], motion()
+    torque, _ = asymmetry.torque(here, 1, {"viscous": 0.5, "coulomb": 0.2}, "viscous and Coulomb")
+    np.testing.assert_allclose(torque[:, 1], 0.5 * np.abs(here.motor_speed[:, 1]) + 0.2, atol=1e-12)
+
+
 def test_a_saturating_constant_reads_the_more_too_much_the_larger_the_torque() -> None:
     gain, here = EFFECTS["motor_torque_gain"], motion()
     values = {"error": 0.02, "cubic": 1e-3}
