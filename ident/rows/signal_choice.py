@@ -326,7 +326,7 @@ class _Bench:
         where = "in the model alone, the parameters come from the sign" if bends else "in the rows too"
         reasons.append(
             f"friction: tanh of the speed over {best.width:g} rad/s, held-back error over all samples "
-            f"{100.0 * -np.expm1(-gain):.1f} % less than with the sign; {where}"
+            f"{_less(gain)} than with the sign; {where}"
         )
         return best, Coulomb() if bends else best
 
@@ -367,9 +367,15 @@ def _reversal_s(rows: ByClass, band: float | None, standstill_rad_s: float, reas
     chosen = _WINDOWS[best] * BIN_S
     reasons.append(
         f"reversals: {1e3 * chosen:.0f} ms left out on either side, held-back error far from reversals "
-        f"{100.0 * np.expm1(errors[0] - errors[best]):.2f} % less than with all samples"
+        f"{_less(errors[0] - errors[best])} than with all samples"
     )
     return chosen
+
+
+def _less(fall: float) -> str:
+    """A fall of the log of an error in words; a large one as a factor."""
+    factor = float(np.exp(fall))
+    return f"{factor:.3g} times smaller" if factor >= 2.0 else f"{100.0 * (1.0 - 1.0 / factor):.2g} % less"
 
 
 def _turning_rad(rows: ByClass, settings: SignalSettings, reasons: list[str]) -> float:

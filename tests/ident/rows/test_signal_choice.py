@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -142,6 +143,19 @@ def test_a_drive_that_turns_slowly_has_its_reversals_left_out():
     turned = dataclasses.replace(session, motor=dataclasses.replace(session.motor, effort=effort))
     assert late <= chosen(turned).settings.reversal_s <= 0.1
     assert chosen(session).settings.reversal_s < late
+
+
+@pytest.mark.parametrize(
+    ("turned", "words"), [(0.02, r"\d+ % less than with all"), (1.0, r"\d[\d.]* times smaller than with all")]
+)
+def test_the_gain_beside_reversals_is_a_share_of_the_error_or_a_factor(turned: float, words: str):
+    session = arm.session(sensors=sensors(joint=0.01, motor=0.01))
+    time = session.motor.publish_time * 1e-9 - 3.0
+    before, now = (np.sign(arm.fourier(at, 10.0, 5)[1]) for at in (time - 0.04, time))
+    effort = session.motor.effort + turned * arm.drive("Fcm") * (before - now)
+    late = dataclasses.replace(session, motor=dataclasses.replace(session.motor, effort=effort))
+    said = next(reason for reason in chosen(late).reasons if reason.startswith("reversals"))
+    assert re.search(words, said), said
 
 
 @pytest.mark.parametrize(
