@@ -424,24 +424,41 @@ class _Guesser:
                 why = f"{rate:g} Hz, from the positions against {velocity.shown}{self._going_back(count)}"
                 self.rows.append(("time", "", "", why))
                 return TimeBase(rate_hz=rate), np.arange(count) / rate
+        for one, rows in self._falls(count):
+            raise DataError(f"{self.source}: {self._fall(one, rows)}")
         raise DataError(
             f"{self.source}: no rising column of times; give the rate of the samples with --rate-hz"
         )
 
+    def _falls(self, count: int) -> list[tuple[Field, NDArray[np.int64]]]:
+        """The columns of times of `count` samples that go back, and the rows that begin so; the fewest first."""
+        clocks = [one for one in self.fields if one.quantity == "time" and len(one.values) == count]
+        falls = [(one, np.flatnonzero(np.diff(one.values[:, 0]) < 0.0) + 1) for one in clocks]
+        return sorted((pair for pair in falls if len(pair[1])), key=lambda pair: len(pair[1]))
+
     def _going_back(self, count: int) -> str:
         """Why a column of times is not used, for the table. DataError where the order of the samples is in doubt."""
-        for one in self.fields:
-            if one.quantity == "time" and len(one.values) == count:
-                back = np.flatnonzero(np.diff(one.values[:, 0]) < 0.0)
-                if len(back) > max(1.0, _STEPS_BACK * count):
-                    raise DataError(
-                        f"{self.source}: the times of {one.shown} go back in {len(back)} of {count} rows, first in row "
-                        f"{back[0] + 2}; sort the rows by their times, or give the rate of the samples with --rate-hz "
-                        "if the rows are in order"
-                    )
-                if len(back):
-                    return f"; {one.shown} goes back in row {back[0] + 2} and is not used"
+        for one, rows in self._falls(count):
+            if len(rows) > max(1.0, _STEPS_BACK * count):
+                raise DataError(f"{self.source}: {self._fall(one, rows)}")
+            row = self.numbers[count][rows[0]]
+            return f"; {one.shown} goes back in row {row} (counted from 0) and is not used"
         return ""
+
+    def _fall(self, clock: Field, rows: NDArray[np.int64]) -> str:
+        """Where a column of times goes back, in `rows`, and what to do."""
+        times, row = clock.values[:, 0], int(rows[0])
+        numbers = self.numbers[len(times)]
+        said = (
+            f"the times of {clock.shown} go back in {len(rows)} of {_rows(len(times))}, first in row {numbers[row]} "
+            f"(counted from 0), {times[row]:.12g} after {times[row - 1]:.12g}"
+        )
+        before = np.flatnonzero(times[:row] == times[row])
+        if len(before):
+            advice = f"the time of row {numbers[before[0]]} again: remove the rows that repeat others"
+        else:
+            advice = "sort the rows by their times, or correct a wrong time"
+        return f"{said}; {advice}, or give the rate of the samples with --rate-hz if the rows are in order"
 
     def _clock_of(self, count: int) -> Field | None:
         """The column of times of `count` samples; of a date split in two, the finer part."""
@@ -473,15 +490,18 @@ class _Guesser:
             )
         base = TimeBase(1, unit=unit)
         column: str | int = clock.array or (clock.columns[0] if clock.columns else 1)
-        equal = bool((np.diff(times) == 0).any())
+        again = np.flatnonzero(np.diff(times) == 0) + 1
         found = TimeBase(
             column=column,
             file=clock.file if isinstance(clock.file, str) else None,
             unit=unit,
             zero="unix" if times[0] * base.seconds > _UNIX_S else "start",
-            equal="spread" if equal else "refuse",
+            equal="spread" if len(again) else "refuse",
         )
-        why = f"steps of {step:.4g} on average" + (", equal times spread" if equal else "")
+        why = f"steps of {step:.4g} on average"
+        if len(again):
+            first = self.numbers[len(times)][again[0]]
+            why += f", equal times spread: {_rows(len(again))}, first row {first} (counted from 0)"
         self.used.add(clock.name)
         self.rows.append(("time", clock.shown, unit, why))
         seconds = self._seconds(len(times))

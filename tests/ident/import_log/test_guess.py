@@ -255,7 +255,35 @@ def test_what_cannot_be_told_is_said(
 def test_a_column_of_times_with_a_step_back_is_left_out_with_the_reason(arm: Path, tmp_path: Path) -> None:
     names = ["t", *columns("q{k}"), *columns("dq{k}"), *columns("tau{k}")]
     path = write(tmp_path / "run.csv", names, np.where(np.arange(N) < 50, T, T - 0.3), Q, QD, TAU)
-    assert "; t goes back in row 51 and is not used" in str(guess_mapping(path, arm))
+    assert "; t goes back in row 50 (counted from 0) and is not used" in str(guess_mapping(path, arm))
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        (
+            np.where(np.arange(N) == 80, T - 0.1, T),
+            r"in 1 of 400 rows, first in row 80 \(counted from 0\), 0.22 after",
+        ),
+        (
+            T[np.r_[:100, 90 : N - 10]],
+            "in row 100 .*the time of row 90 again: remove the rows that repeat others",
+        ),
+    ],
+    ids=["a stamp too early", "rows twice"],
+)
+def test_a_column_of_times_that_nearly_rises_is_named_with_the_row(
+    times: np.ndarray, said: str, arm: Path, tmp_path: Path
+) -> None:
+    path = write(tmp_path / "run.csv", ["t", *columns("q{k}"), *columns("tau{k}")], times, Q, TAU)
+    with pytest.raises(DataError, match=f"the times of t go back .*{said}.*--rate-hz"):
+        guess_mapping(path, arm)
+
+
+def test_a_time_twice_is_told_with_its_row(arm: Path, tmp_path: Path) -> None:
+    times = np.where(np.arange(N) == 80, T[79], T)
+    path = write(tmp_path / "run.csv", ["t", *columns("q{k}"), *columns("tau{k}")], times, Q, TAU)
+    assert "equal times spread: 1 row, first row 80 (counted from 0)" in str(guess_mapping(path, arm))
 
 
 @pytest.mark.parametrize(
