@@ -26,11 +26,11 @@ TEXTS = frozenset({".csv", ".txt", ".dat", ".tsv"})
 QUANTITIES: dict[str, frozenset[str]] = {
     "acceleration": _words("acceleration acc accel ddq qdd qddot qpp beschleunigung"),
     "velocity": _words(
-        "velocity vel velocities dq qd qdot qp dth thd dtheta thetad thetadot omega speed qvel jvel geschwindigkeit "
+        "velocity vel velo velocities dq qd qdot qp dth thd dtheta thetad thetadot omega speed spd geschwindigkeit "
         "drehzahl"
     ),
-    "torque": _words("torque tau effort trq tq moment qfrc jtau drehmoment motormoment"),
-    "position": _words("position pos q th theta angle ang qpos jpos winkel gelenkwinkel achswinkel"),
+    "torque": _words("torque tau effort trq tq moment qfrc drehmoment motormoment"),
+    "position": _words("position pos q th theta angle ang winkel gelenkwinkel achswinkel"),
     "current": _words("current curr cur amp ampere i iq strom motorstrom"),
     "time": _words("time t stamp timestamp clock sec secs seconds ts timestep zeit zeitstempel"),
 }
@@ -44,10 +44,25 @@ _ASIDE = _words(
 _SENSED = _words("sm sensor sensed measured meas msr actual act fb feedback real raw ist istwert")
 _FILTERED = _words("filt filtered filter smooth smoothed lp lowpass")
 _MOTOR = _words("motor mot motors drive actuator motormoment antrieb")
+_NUMBERED = re.compile(r"(?<![A-Za-z])(?:joint|jnt|j|axis|ax|achse|gelenk)[\s_.\-]*(\d+)", re.IGNORECASE)
+"""A joint's number in the name of a column."""
+_SHORTEST = 3
+"""Letters of the least quantity behind a prefix."""
 _AXES = _words("achse gelenk")
 """German for a joint: `Achse 1 Ist` is its position."""
+_PREFIXES = _words("q j jnt joint axis ax ang angular rot arm")
+"""Written before a quantity without a mark, as in `angvel` and `jointpos`; so are words of sensors and motors."""
 _UNITS = {"mnm": r"mN[.·*-]?m(?![A-Za-z])|N[.·*-]?mm(?![A-Za-z])", "ma": r"(?<![A-Za-z])mA(?![A-Za-z])"}
 """Units of two cases, each one word."""
+_BRACKETS = re.compile(r"[(\[{]([^()\[\]{}]*[^()\[\]{}\d\s][^()\[\]{}]*)[)\]}]")
+_OF_UNIT = {
+    "acceleration": _words("rad/s^2 rad/s2 rad/s² deg/s^2 deg/s2 deg/s² °/s^2 °/s2 °/s² m/s^2 m/s2 m/s²"),
+    "velocity": _words("rad/s rad/sec deg/s deg/sec °/s rpm 1/min u/min m/s mm/s"),
+    "torque": _words("nm n.m n·m n*m n-m mnm nmm"),
+    "position": _words("rad mrad deg °"),
+    "current": _words("a ma"),
+}
+"""Units in brackets that tell the quantity where the name does not, as in `T_mot J1 (Nm)`."""
 
 
 @dataclass(frozen=True)
@@ -69,18 +84,26 @@ class Field:
     @property
     def words(self) -> tuple[str, ...]:
         """Words of the name in lower case, plurals as singulars."""
-        name = self.name
+        name = re.sub(r"°(?!\s*C)", " deg ", self.name)
         for unit, spelling in _UNITS.items():
             name = re.sub(spelling, f" {unit} ", name)
         parts = re.findall("[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower())
-        known = frozenset().union(_ASIDE, _SENSED, *QUANTITIES.values())
-        return tuple(part[:-1] if part not in known and part[:-1] in known else part for part in parts)
+        known = frozenset().union(_ASIDE, _SENSED, _MOTOR, _FILTERED, *QUANTITIES.values())
+        parts = [part[:-1] if part not in known and part[:-1] in known else part for part in parts]
+        return tuple(word for part in parts for word in ((part,) if part in known else _compound(part)))
+
+    @property
+    def _by_unit(self) -> str | None:
+        """The quantity by a unit in brackets."""
+        units = {re.sub(r"\s", "", unit).lower() for unit in _BRACKETS.findall(self.name)}
+        return next((name for name, known in _OF_UNIT.items() if units & known), None)
 
     @property
     def quantity(self) -> str | None:
         """Key of `QUANTITIES`, or None for a name without such a word or of something not measured."""
         words = set(self.words)
-        if self.values.shape[1] == 1 and words & QUANTITIES["time"]:
+        by_unit = self._by_unit
+        if self.values.shape[1] == 1 and words & QUANTITIES["time"] and by_unit is None:
             return "time"
         if words & _ASIDE:
             return None
@@ -88,7 +111,8 @@ class Field:
             return "velocity"
         if words & _AXES and words & _SENSED and words <= _AXES | _SENSED:
             return "position"
-        return next((name for name, known in QUANTITIES.items() if words & known and name != "time"), None)
+        by_name = (name for name, known in QUANTITIES.items() if words & known and name != "time")
+        return next(by_name, by_unit)
 
     @property
     def of_motor(self) -> bool:
@@ -211,15 +235,28 @@ def _one_a_joint(found: list[Field], joints: Sequence[str]) -> list[Field]:
 
 
 def split_name(name: str, joints: Sequence[str]) -> tuple[str, str]:
-    """The name without its joint, and the joint: a name of the URDF, or the last number."""
+    """The name without its joint, and the joint: a name of the URDF, the number behind a word such as `joint`, or the
+    last number that is not of a unit in brackets."""
     for joint in sorted(joints, key=len, reverse=True):
         match = re.search(rf"(?<![A-Za-z0-9]){re.escape(joint)}(?![0-9])", name, re.IGNORECASE)
         if match:
             return name[: match.start()] + name[match.end() :], joint
-    number = re.search(r"(\d+)(?!.*\d)", name)
+    plain = _BRACKETS.sub(lambda unit: " " * len(unit[0]), name)
+    number = _NUMBERED.search(plain) or re.search(r"(\d+)(?!.*\d)", plain)
     if number:
-        return name[: number.start()] + name[number.end() :], number[1]
+        return name[: number.start(1)] + name[number.end(1) :], number[1]
     return name, ""
+
+
+def _compound(word: str) -> tuple[str, ...]:
+    """The parts of two words written as one, as in `angvel`; else the word."""
+    firsts = sorted(_PREFIXES | _MOTOR | _SENSED, key=len, reverse=True)
+    quantities = frozenset().union(*QUANTITIES.values())
+    for first in firsts:
+        rest = word.removeprefix(first)
+        if len(rest) in range(_SHORTEST, len(word)) and rest in quantities:
+            return first, rest
+    return (word,)
 
 
 def _order(label: str, joints: Sequence[str]) -> tuple[int, int]:

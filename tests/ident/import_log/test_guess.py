@@ -56,6 +56,7 @@ HABITS: dict[str, tuple[str, str, str, str]] = {
     "brackets": ("timestamp_s", "state.q[{k}]", "state.qd[{k}]", "state.tau_J[{k}]"),
     "between": ("time", "joint_{k}_position", "joint_{k}_velocity", "joint_{k}_torque"),
     "German": ("Zeit", "Achse {k} Ist", "Geschwindigkeit {k}", "Moment {k}"),
+    "units": ("t [s]", "ang {k}", "angvel {k} [rad/s]", "T J{k} (Nm)"),
     "angles": ("clock", "th_{k}", "thd_{k}", "trq_{k}"),
 }
 
@@ -293,17 +294,29 @@ def test_a_time_twice_is_told_with_its_row(arm: Path, tmp_path: Path) -> None:
         ("ddq", "acceleration"), ("tau_ext_hat_filtered", None), ("TorqueCur", "torque"),
         ("currentPosition", "position"), ("actual_TCP_speed_", None), ("joint_temperatures", None),
         ("efforts", "torque"), ("Achse  Ist", "position"), ("Achse  Soll", None), ("Moment ", "torque"),
-        ("Achse  Istmoment", None), ("Achse  Ist Drehmoment", "torque"), ("Achse  Strom", "current"),
-        ("Gelenk  Geschwindigkeit", "velocity"), ("Achse ", None),
+        ("Achse  Istmoment", "torque"), ("Achse  Ist Drehmoment", "torque"), ("Achse  Strom", "current"),
+        ("Gelenk  Geschwindigkeit", "velocity"), ("Achse ", None), ("angvel_", "velocity"), ("jointPos", "position"),
+        ("motortorque_", "torque"), ("actvel", "velocity"), ("axis_spd_", "velocity"), ("T_mot J (Nm)", "torque"),
+        ("J  [rad/s]", "velocity"), ("J (°)", "position"), ("J (°C)", None), ("J  [rad/s^2]", "acceleration"),
+        ("T_d J (Nm)", None), ("qpos", "position"), ("jtau", "torque"), ("state.q[]", "position"),
     ],
 )  # fmt: skip
 def test_words_of_a_name(name: str, quantity: str | None) -> None:
     assert Field(name, ("",) * 3, np.zeros((2, 3))).quantity == quantity
 
 
+def test_a_torque_of_one_motor_by_its_unit_is_no_time() -> None:
+    one = Field("T_mot J (Nm)", ("1",), np.zeros((2, 1)))
+    assert (one.quantity, one.of_motor) == ("torque", True)
+
+
 def test_a_joint_in_a_name_is_found_whole() -> None:
     assert split_name("joint_10_pos", ["joint_1", "joint_10"]) == ("_pos", "joint_10")
     assert split_name("q12", ["joint_1"]) == ("q", "12")
+    assert split_name("ddq3 [rad/s^2]", []) == ("ddq [rad/s^2]", "3")
+    assert split_name("state.q[3]", []) == ("state.q[]", "3")
+    assert split_name("J3 pos 16bit", []) == ("J pos 16bit", "3")
+    assert split_name("T_mot J1 (Nm)", []) == ("T_mot J (Nm)", "1")
     assert split_name("PANDA_JOINT1.effort", JOINTS) == (".effort", "panda_joint1")
 
 
