@@ -10,7 +10,7 @@ from typing import Any
 
 from ident.diagnosis.rivals import margin
 from ident.effects import EFFECTS, described, summary_of
-from ident.effects.words import joints_text, named, quantity_text, spoken
+from ident.effects.words import MODELS, joints_text, named, quantity_text, spoken
 
 Plain = Mapping[str, Any]
 
@@ -44,7 +44,7 @@ class Comparison:
 @dataclass(frozen=True)
 class FindingStatement:
     """One finding. facts : error, alternatives, discriminating motion; statistics : parameters with their meaning and
-    the figures behind the claim; both as (label, text).
+    the figures behind the claim; both as (label, text). doubt : why it is open, empty for one that is not.
     """
 
     number: int
@@ -54,7 +54,12 @@ class FindingStatement:
     confidence: str
     facts: tuple[tuple[str, str], ...]
     statistics: tuple[tuple[str, str], ...]
-    is_open: bool
+    doubt: str
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the cause is not sure and others are possible."""
+        return bool(self.doubt)
 
     def lines(self) -> list[str]:
         """For the terminal."""
@@ -80,9 +85,17 @@ def values_of(finding: Plain) -> dict[str, tuple[float, float, str]]:
 
 
 def finding_statement(
-    number: int, finding: Plain, names: Sequence[str], sure: float = SURE, *, both: bool = False
+    number: int,
+    finding: Plain,
+    names: Sequence[str],
+    sure: float = SURE,
+    *,
+    both: bool = False,
+    compared: bool = False,
+    told_apart: bool = False,
 ) -> FindingStatement:
-    """A finding in words. both : whether the sessions have both torques."""
+    """A finding in words. both : whether the sessions have both torques. compared : with a healthy arm. told_apart :
+    from all its alternatives by the motion of these sessions."""
     cause, mode, side = str(finding["cause"]), finding.get("mode"), str(finding.get("side", ""))
     detail = finding.get("detail")
     meaning = ""
@@ -91,9 +104,12 @@ def finding_statement(
     elif finding.get("parameters"):
         meaning = f"{summary_of(cause)}: {described(cause, values_of(finding), finding.get('form'), names)}"
         meaning += f", {mode} sessions." if mode else "."
+        meaning = meaning.replace(MODELS, "the healthy arm's") if compared else meaning
     seen = _SEEN_BY_BOTH if both and side == "joint" else _SEEN.get(side, "")
     confidence, others = finding.get("confidence"), finding.get("alternatives") or []
-    open_ = is_open(confidence, others, sure)
+    doubt = ""
+    if is_open(confidence, others, sure):
+        doubt = "open: the cause may be none of the look-alikes" if told_apart else "open between look-alikes"
     known = "no confidence given" if confidence is None else f"confidence {confidence:.2f}"
     facts = []
     evidence = finding.get("evidence") or {}
@@ -114,10 +130,10 @@ def finding_statement(
         cause,
         placed(finding, names, always=True),
         " ".join(part for part in (capital(meaning), seen) if part),
-        known + (", open between look-alikes" if open_ else ""),
+        known + (f", {doubt}" if doubt else ""),
         tuple(facts),
         tuple(_statistics(finding)),
-        open_,
+        doubt,
     )
 
 
@@ -126,8 +142,9 @@ def _noises(times: float) -> str:
     return f"{times:.2g} times" if times >= 0.01 else "less than 0.01 times"
 
 
-def comparison(entry: Plain, names: Sequence[str], place: int = 0) -> Comparison:
-    """Two causes side by side, from the plain content of a `LookAlikes`."""
+def comparison(entry: Plain, names: Sequence[str], place: int = 0, *, neither: bool = False) -> Comparison:
+    """Two causes side by side, from the plain content of a `LookAlikes`. neither : of an unsure finding that is told
+    apart from all its alternatives."""
     first, second = (
         f"{spoken(one['cause'])} ({joints_text(one['joints'], names)})" for one in entry["causes"]
     )
@@ -139,7 +156,7 @@ def comparison(entry: Plain, names: Sequence[str], place: int = 0) -> Comparison
             "of the arm of the same shape"
         )
     else:
-        verdict = "these sessions do"
+        verdict = "these sessions do" + ("; the cause may be neither" if neither else "")
     overlap = (
         f"overlap {entry['overlap']:.3f}: beside a refitted base model, {first} leaves "
         f"{_noises(entry['strength'][0])} the noise; {_noises(entry['apart'])} of it {second} cannot leave as well. "

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -150,9 +151,21 @@ def statements(
     sure = float(details.get("sure", SURE))
     claims = [*content.get("findings", []), *content.get("character", [])]
     both = sum(map(bool, ((content.get("baseline") or {}).get("noise_floor") or {}).values())) > 1
+    pairs = details.get("look_alikes") or []
+    apart = Counter(p["finding"] for p in pairs if p["told_apart"] and not p["shape_alone"])
+    told_apart = {
+        number
+        for number, one in enumerate(claims, start=1)
+        if apart[number] >= len(one.get("alternatives") or ()) > 0
+    }
+    compared = bool(details.get("reference"))
     said = [
-        finding_statement(number, one, names, sure, both=both) for number, one in enumerate(claims, start=1)
+        finding_statement(
+            number, one, names, sure, both=both, compared=compared, told_apart=number in told_apart
+        )
+        for number, one in enumerate(claims, start=1)
     ]
+    unsure = {one.number for one in said if one.is_open} & told_apart
     count = len(content.get("findings", []))
     findings, character = said[:count], said[count:]
     level, headline = _headline(content, details, findings)
@@ -175,7 +188,7 @@ def statements(
         tuple(answer_statement(answer, names) for answer in answers),
         tuple(findings),
         tuple(character),
-        tuple(comparison(one, names, k) for k, one in enumerate(details.get("look_alikes") or [])),
+        tuple(comparison(one, names, k, neither=one["finding"] in unsure) for k, one in enumerate(pairs)),
         tuple(part for part in parts if part.sentences or part.rows),
     )
 
@@ -264,12 +277,13 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
             "look",
             "Channels of these data cannot be what they say: mend them first; no cause is named from them",
         )
-    doubtful, count = sum(finding.is_open for finding in findings), len(findings)
+    doubts, count = [finding.doubt for finding in findings if finding.is_open], len(findings)
+    doubt = doubts[0] if len(set(doubts)) == 1 else "open"
     if count == 1:
-        return "look", "One cause found" + (", open between look-alikes" if doubtful else "")
+        return "look", "One cause found" + (f", {doubt}" if doubts else "")
     if count:
-        doubt = f", {'one' if doubtful == 1 else doubtful} of them open between look-alikes"
-        return "look", f"{count} causes found, the largest effect first" + (doubt if doubtful else "")
+        doubtful = f", {'one' if len(doubts) == 1 else len(doubts)} of them {doubt}"
+        return "look", f"{count} causes found, the largest effect first" + (doubtful if doubts else "")
     if content.get("character"):
         return "good", "No cause found beyond the character of such an arm, which the extended model now has"
     rest = [*content.get("nameless", []), *content.get("unexplained", [])]

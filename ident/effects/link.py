@@ -26,7 +26,7 @@ from ident.effects.effect import (
 )
 from ident.effects.motion import ArmMotion, Floats, dahl
 from ident.effects.springs import Springs
-from ident.effects.words import Values, one_joint, quantity, quantity_text, times, wave
+from ident.effects.words import MODELS, Values, one_joint, quantity, quantity_text, times, wave
 from ident.rows.filters import differentiate, low_pass, settling
 
 # Cut-off of a twist before it is differentiated, with the link and with the motor displaced [Hz].
@@ -50,6 +50,8 @@ class _Twisting(Effect):
     depends_on = "load"
     displaces = True
     evidence_factor = 2.0
+    against = ""
+    """What the size is on top of, in words."""
 
     @abstractmethod
     def twist(self, torque: Any, parameters: Parameters) -> Any:
@@ -73,7 +75,7 @@ class _Twisting(Effect):
         first = self.linear[0].name
         width = [f"crossed within {quantity(values['width'])}"] if "width" in values else []
         place = "the motors" if form is _Encoder.MOTOR else "the links"
-        return [f"{first} {quantity(values[first])}", *width, f"the encoders sit at {place}"]
+        return [f"{first} {quantity(values[first])}{self.against}", *width, f"the encoders sit at {place}"]
 
 
 def _places(setting: Setting) -> tuple[_Encoder, ...]:
@@ -100,6 +102,7 @@ class JointElasticity(_Twisting):
         Parameter("compliance", "rad/Nm", "twist per torque beyond the model's", low=0.0, high=0.02),
         Parameter("size", "rad/Nm", "of the ringing links", shape=True, low=1e-7, high=0.02, optional=True),
     )
+    against = f" more than {MODELS}"
     confused_with = ("backlash", "joint_zero_offset", "joint_torque_delay")
     experiment = Discriminator.CHIRP
     tell_apart = "a 1 to 15 Hz chirp of joint {joint} with two payloads"

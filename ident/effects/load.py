@@ -26,7 +26,7 @@ from ident.effects.effect import (
     both_sides,
 )
 from ident.effects.motion import ArmMotion, Floats
-from ident.effects.words import Values, quantity, quantity_text
+from ident.effects.words import Triple, Values, quantity, quantity_text
 
 # Places among the ten inertial parameters: mass and first moments, and the six of the inertia.
 _MASS, _MOMENTS, _INERTIA = 9, (6, 7, 8), range(6)
@@ -91,10 +91,16 @@ class _Payload(Effect):
         return tuple(both_sides(_body_torque(motion, place)) for place in _INERTIA)
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
-        """Mass and first moments."""
-        axes = ", ".join(quantity_text(*values[axis]) for axis in _AXES)
-        mass = f"mass {quantity(values['mass'])}, " if "mass" in values else ""
-        return [f"{mass}first moments (x, y, z) {axes}"]
+        """Mass and first moments, as far as they are known."""
+        found = [self.mass_text(values["mass"])] if "mass" in values else []
+        if set(_AXES) <= set(values):
+            axes = ", ".join(quantity_text(*values[axis]) for axis in _AXES)
+            found.append(f"first moments (x, y, z of the last link's frame, z along its joint's axis) {axes}")
+        return [", ".join(found)]
+
+    def mass_text(self, mass: Triple) -> str:
+        """The mass in words."""
+        raise NotImplementedError
 
 
 class PayloadError(_Payload):
@@ -122,6 +128,11 @@ class PayloadError(_Payload):
         """Torque of a unit mass and unit first moments in the last link, in all rows of loaded sessions."""
         share = float(motion.loaded)
         return tuple(both_sides(share * _body_torque(motion, place)) for place in (_MASS, *_MOMENTS))
+
+    def mass_text(self, mass: Triple) -> str:
+        """The mass against the announced one."""
+        value, std, unit = mass
+        return f"mass {quantity((abs(value), std, unit))} {'less' if value < 0.0 else 'more'} than announced"
 
 
 class _Change(Form):
@@ -191,9 +202,13 @@ class PayloadChange(_Payload):
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """Size, and time of the change."""
-        when = f"at {quantity(values['time'])} of session {values['session'][0]:.0f}"
-        loose = ["it slides back and forth", f"from {when}"] if form is _Change.LOOSE else [when]
-        return [*super().sentence(values, form, names), *loose]
+        when = f"{quantity(values['time'])} of session {values['session'][0]:.0f}"
+        told = f"it slides back and forth from {when}" if form is _Change.LOOSE else f"at {when}"
+        return [*super().sentence(values, form, names), told]
+
+    def mass_text(self, mass: Triple) -> str:
+        """The jump of the mass."""
+        return f"the mass changes by {quantity(mass)}"
 
 
 def slide(lean: Floats) -> Floats:

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 Triple = tuple[float, float, str]
 Values = Mapping[str, Triple]
 """Value, standard deviation and unit by name."""
+MODELS = "the model's"
+"""What a value is told against: the base model's own, which is the healthy arm's where there is a reference."""
 
 
 def quantity_text(value: float, std: float, unit: str) -> str:

@@ -71,6 +71,36 @@ def test_the_confidence_that_counts_as_sure_is_a_setting() -> None:
     assert "could also be" not in statements(CONTENT, details(sure=0.8), NAMES).text()
 
 
+PAIR: dict[str, Any] = {
+    "finding": 1, "causes": [{"cause": "viscous_nonlinear", "joints": [2]}, {"cause": "stribeck", "joints": [2]}],
+    "overlap": 0.66, "strength": [10.0, 8.0], "apart": 7.7, "needed": 4.7, "told_apart": True, "shape_alone": False,
+    "decides": ["a slow sweep", "another"], "foreseen": None,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("apart", "headline"), [(True, "may be none of the look-alikes"), (False, "between look-a")]
+)
+def test_an_unsure_finding_told_apart_from_its_look_alikes_is_not_open_between_them(
+    apart: bool, headline: str
+) -> None:
+    pair = {**PAIR, "told_apart": apart}
+    said = statements(CONTENT, details(sure=0.9, look_alikes=[pair]), NAMES)
+    text = " ".join(said.text().split())
+    assert headline in said.headline
+    assert headline in said.findings[0].confidence
+    assert ("these sessions do; the cause may be neither" in text) == apart
+    assert ("open between look-alikes" in text) != apart
+
+
+@pytest.mark.parametrize(("reference", "owner"), [(True, "the healthy arm's"), (False, "the model's")])
+def test_a_compliance_is_told_as_an_increase(reference: bool, owner: str) -> None:
+    compliance = {"compliance": {"value": 2.5e-4, "std": 1e-5, "unit": "rad/Nm"}}
+    soft = {**FINDING, "cause": "joint_elasticity", "parameters": compliance, "form": "encoder at the motor"}
+    (said,) = statements({**CONTENT, "findings": [soft]}, details(reference=reference), NAMES).findings
+    assert f"compliance 0.00025 ± 1e-05 rad/Nm more than {owner}" in said.text
+
+
 @pytest.mark.parametrize(
     ("share", "healthy", "unexplained", "level", "headline"),
     [
