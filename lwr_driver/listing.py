@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
@@ -65,6 +66,19 @@ class Listing:
             )
             for group in groups
         ]
+
+
+def in_units(
+    head: Sequence[str], rows: Sequence[Sequence[str]], units: Sequence[str], indent: int = 2
+) -> Listing:
+    """A table with `{unit}` in its head where the unit stands; rows of several units have it in a last column.
+
+    units : of each row.
+    """
+    if len(set(units)) <= 1:
+        return Listing([name.format(unit=next(iter(units), "Nm")) for name in head], rows, indent)
+    plain = [re.sub(r"[ \[]*\{unit\}\]?", "", name) for name in head]
+    return Listing([*plain, "unit"], [[*row, unit] for row, unit in zip(rows, units, strict=True)], indent)
 
 
 Piece = str | Listing

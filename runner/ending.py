@@ -29,7 +29,8 @@ if TYPE_CHECKING:  # a command imports its own alone
     from lwr_driver.session.session import SessionSummary
     from runner.preflight import Preflight
 
-_AT_ONCE_MRAD = 0.1
+_AT_ONCE = 0.1
+"""Path [mrad, mm] below which friction turns at once."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +96,12 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     found += estimate_lines(summary)
     turning = (summary.get("choice") or {}).get("friction_turns")
     if turning:
-        lengths = [1e3 * one for one in turning["length_rad"].values()]
-        least, most = (f"{float(f'{one:.2g}'):g}" for one in (min(lengths), max(lengths)))
+        kinds = (("mrad", turning["length_rad"]), ("mm", turning.get("length_m") or {}))
+        lengths = [1e3 * one for _, own in kinds for one in own.values()]
         error = turning["torque_error_percent"]
-        span = most if least == most else f"{least} to {most}"
+        spans = " and ".join(_span(own, unit) for unit, own in kinds if own)
         # Over less than an encoder's noise it turns at once, and only rests are predicted better.
-        turns = "stays at rest as it was" if max(lengths) < _AT_ONCE_MRAD else f"turns over {span} mrad"
+        turns = "stays at rest as it was" if max(lengths) < _AT_ONCE else f"turns over {spans}"
         drives = f"{len(lengths)} drives" if len(lengths) > 1 else "one drive"
         text = f"of {drives} {turns}, in the model: "
         text += f"motor torque error of the fit {error['without']:.3g} -> {error['with']:.3g} %"
@@ -115,6 +116,13 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     elif "condition" in summary:
         found.append(("condition number", f"{summary['condition']:.4g}"))
     return found
+
+
+def _span(lengths: Mapping[str, float], unit: str) -> str:
+    """Lengths by joint [rad or m] in thousandths, from the least to the most."""
+    sizes = [1e3 * one for one in lengths.values()]
+    least, most = (f"{float(f'{one:.2g}'):g}" for one in (min(sizes), max(sizes)))
+    return f"{most} {unit}" if least == most else f"{least} to {most} {unit}"
 
 
 def _delay_of(summary: Mapping[str, Any], side: str) -> str:
@@ -167,7 +175,10 @@ def of_validation(found: Validation, tables: Sequence[Piece], sessions: Sequence
     joints = max(worst.scores, key=lambda score: -1.0 if math.isnan(score.relative) else score.relative)
     numbers = [
         ("sessions", f"{len(own)}" + (f", the best {100 * min(own):.2f} %" if len(own) > 1 else "")),
-        ("largest", f"{joints.joint} {joints.side}, {100 * joints.relative:.1f} %, rms {joints.rms:.3f} Nm"),
+        (
+            "largest",
+            f"{joints.joint} {joints.side}, {100 * joints.relative:.1f} %, rms {joints.rms:.3f} {joints.unit}",
+        ),
         ("compared with", ", ".join(dict.fromkeys(one.predictor for one in found.competitors)) or "nothing"),
     ]
     look = [Verdict("not validated", f"{one}", "", "bad") for one in found.unscored]
@@ -217,7 +228,7 @@ def of_payload(found: PayloadEstimate, arm: Path, sessions: Sequence[Path], out:
     numbers = [
         ("centre of mass", f"{com} mm"),
         ("mass", found.verdict),
-        ("residual rms", f"up to {max(found.residual.values()):.3f} Nm"),
+        ("residual rms", f"up to {found.largest_residual}"),
     ]
     again = ["lwr-run payload", *(quote(str(path)) for path in (arm, *sessions)), "--out with_payload.yaml"]
     next_step = " ".join(again) if out is None else f"lwr-run export {quote(str(out))} arm.urdf"

@@ -18,6 +18,7 @@ from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.selection import Claim
 from ident.diagnosis.task import State, Task
 from ident.diagnosis.tolerances import usual_change
+from ident.dynamics.parameters import joint_unit
 from ident.effects import LOST_SAMPLES, SENSOR_SATURATION
 from ident.rows.data_quality import SampleLoss
 
@@ -82,8 +83,9 @@ def _parameters(trial: Trial, bench: DiagnosisBench) -> dict[str, Value]:
         # The scale of a healthy arm differs from that of its reference.
         scale = effect.linear[0].name
         deviations[scale] = float(np.hypot(deviations[scale], change))
+    slides = not effect.whole_arm and bool(bench.nominal.arm.chain.prismatic[trial.candidate.joint])
     return {
-        p.name: Value(values[p.name], deviations[p.name], p.unit)
+        p.name: Value(values[p.name], deviations[p.name], joint_unit(p.unit, prismatic=slides))
         for p in effect.parameters
         if p.name in values and p.name not in effect.hidden
     }

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
-from ident.dynamics.parameters import Floats
+from ident.dynamics.parameters import Floats, joint_unit
 from ident.dynamics.tables import Tabular
 from ident.dynamics.urdf import Joint, read_urdf
 
@@ -257,6 +257,11 @@ class Chain(Tabular):
     def n(self) -> int:
         """Number of joints."""
         return len(self.joint_names)
+
+    @property
+    def torque_units(self) -> tuple[str, ...]:
+        """Unit of each joint's torque, or of its force: `Nm` or `N`."""
+        return tuple(joint_unit("Nm", prismatic=bool(slides)) for slides in self.prismatic)
 
     @classmethod
     def from_table(

@@ -72,6 +72,11 @@ def unit(name: str, *, prismatic: bool = False) -> str:
     return units["o" if kind == "O" else kind]
 
 
+def joint_unit(unit: str, *, prismatic: bool) -> str:
+    """A unit such as `Nm`, `rad` or `rad/Nm`, for a `prismatic` joint in N and m."""
+    return unit.replace("Nm", "N").replace("rad", "m") if prismatic else unit
+
+
 def _inertial(parameters: ArrayLike) -> Floats:
     array = np.asarray(parameters, dtype=np.float64)
     if array.shape[-1:] != (10,):

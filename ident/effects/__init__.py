@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from fri.errors import ConfigurationError
+from ident.dynamics.parameters import joint_unit
 from ident.dynamics.structure import Side
 from ident.effects import channel, drive, link, load, nameless
 from ident.effects.effect import (
@@ -183,9 +184,12 @@ def entry_of(
     joints: Sequence[int],
     values: Mapping[str, tuple[float, float]],
     form: str | None = None,
+    *,
+    prismatic: bool = False,
 ) -> dict[str, Any]:
-    """An entry of a model's effects. joints : from 1. values : value and standard deviation by parameter."""
-    units = {p.name: p.unit for p in effect.parameters}
+    """An entry of a model's effects. joints : from 1. values : value and standard deviation by parameter.
+    prismatic : whether the joint slides."""
+    units = {p.name: joint_unit(p.unit, prismatic=prismatic) for p in effect.parameters}
     return {
         "cause": effect.cause,
         "side": effect.side,

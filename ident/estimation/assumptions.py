@@ -140,6 +140,7 @@ class _Series(NamedTuple):
     times: NDArray[np.int64]
     records: NDArray[np.int64]
     n_eff: float
+    unit: str
 
 
 def _joined(problem: Problem, estimate: Estimate) -> list[_Series]:
@@ -154,6 +155,7 @@ def _joined(problem: Problem, estimate: Estimate) -> list[_Series]:
                 np.concatenate([group.time_index for group, _ in members]),
                 np.concatenate([np.full(len(e), group.record) for group, e in members]),
                 fit.n_eff,
+                row_class.unit,
             )
         )
     return found
@@ -186,7 +188,8 @@ def _mean(series: list[_Series]) -> Check:
     return Check(
         "zero mean",
         p_value > _LEVEL or beyond[large] <= 1.0,
-        f"largest mean {np.mean(series[k].residual):.3g} Nm ({series[k].label}, {limits[k]:.3g} Nm matters), "
+        f"largest mean {np.mean(series[k].residual):.3g} {series[k].unit} ({series[k].label}, "
+        f"{limits[k]:.3g} {series[k].unit} matters), "
         f"{abs(scores[k]):.1f} standard errors",
         "an offset is missing from the model there",
         score,
@@ -197,7 +200,7 @@ def _mean(series: list[_Series]) -> Check:
 def _serial_correlation(series: list[_Series], estimate: Estimate) -> Check:
     """Ljung and Box (1978) over ten lags; Durbin and Watson (1950) for the eye."""
     tests, watson = [], []
-    for _, e, _, times, records, _ in series:
+    for _, e, _, times, records, *_ in series:
         power = float(e @ e) + 1e-300
         joined = (np.diff(times) == 1) & (np.diff(records) == 0)
         watson.append(float(np.sum(np.diff(e)[joined] ** 2) / power))
@@ -237,7 +240,7 @@ def _serial_correlation(series: list[_Series], estimate: Estimate) -> Check:
 def _equal_variance(series: list[_Series], problem: Problem, estimate: Estimate) -> Check:
     """Breusch and Pagan (1979, studentised) on torque size and time; n_eff in place of n."""
     tests, weights = [], []
-    for _, e, fitted, times, _, n_eff in series:
+    for _, e, fitted, times, _, n_eff, _ in series:
         square = e**2
         columns = [np.ones(len(e)), np.abs(fitted), times.astype(np.float64)]
         matrix = np.column_stack([c / (np.abs(c).max() + 1e-300) for c in columns])
@@ -262,7 +265,7 @@ def _equal_variance(series: list[_Series], problem: Problem, estimate: Estimate)
 def _normality(series: list[_Series], problem: Problem, estimate: Estimate) -> Check:
     """Jarque and Bera (1980) with the effective number of rows; consequence by Huber's weights."""
     tests, shapes, weights = [], [], []
-    for _, e, *_, n_eff in series:
+    for _, e, *_, n_eff, _ in series:
         centred = (e - e.mean()) / (e.std() + 1e-300)
         skew, excess = float(np.mean(centred**3)), float(np.mean(centred**4) - 3.0)
         statistic = float(n_eff) / 6.0 * (skew**2 + excess**2 / 4.0)
@@ -294,6 +297,7 @@ class _Moved(NamedTuple):
     label: str
     torque: float
     limit: float
+    unit: str
 
     @classmethod
     def by(cls, problem: Problem, estimate: Estimate, series: Sequence[_Series], shift: Floats) -> _Moved:
@@ -309,7 +313,9 @@ class _Moved(NamedTuple):
         k = int(
             np.argmax([torque / max(limit, 1e-300) for torque, limit in zip(torques, limits, strict=True)])
         )
-        return cls(estimate.names[index], float(own[index]), series[k].label, torques[k], limits[k])
+        return cls(
+            estimate.names[index], float(own[index]), series[k].label, torques[k], limits[k], series[k].unit
+        )
 
     @property
     def matters(self) -> bool:
@@ -319,7 +325,7 @@ class _Moved(NamedTuple):
     def __str__(self) -> str:
         return (
             f"{self.name} by {self.deviations:.2f} of its standard deviations, the torque of {self.label} by "
-            f"{self.torque:.2g} Nm ({self.limit:.2g} matters)"
+            f"{self.torque:.2g} {self.unit} ({self.limit:.2g} matters)"
         )
 
 
@@ -389,9 +395,10 @@ class Weak:
     place: str
     torque: float
     matters: float
+    unit: str = "Nm"
 
     def __str__(self) -> str:
-        return f"{self.name} ({self.torque:.2g} Nm in {self.place}, {self.matters:.2g} Nm matters)"
+        return f"{self.name} ({self.torque:.2g} {self.unit} in {self.place}, {self.matters:.2g} {self.unit} matters)"
 
 
 def weak_parameters(problem: Problem, estimate: Estimate, doubted: Collection[str] = ()) -> list[Weak]:
@@ -407,7 +414,9 @@ def weak_parameters(problem: Problem, estimate: Estimate, doubted: Collection[st
         matters = max(_matters(series), 1e-300)
         size = np.linalg.norm(row_class.factor.r[:, :-1], axis=0) / np.sqrt(max(row_class.factor.rows, 1))
         for k in np.flatnonzero(estimate.std * size > matters):
-            weak = Weak(problem.names[k], row_class.label, float(estimate.std[k] * size[k]), matters)
+            weak = Weak(
+                problem.names[k], row_class.label, float(estimate.std[k] * size[k]), matters, row_class.unit
+            )
             if (
                 weak.name not in found
                 or weak.torque / matters > found[weak.name].torque / found[weak.name].matters
@@ -489,11 +498,13 @@ def _lack_of_fit(problem: Problem, estimate: Estimate, period_rows: int) -> Chec
     }
     label = max(found, key=lambda name: (shares[name], -corrected[name], found[name][0]))
     structured, noise, _ = found[label]
+    unit = next(one.unit for one in problem.classes if one.label == label)
     return Check(
         "lack of fit",
         shares[label] <= 1.0,
-        f"F test p {corrected[label]:.2g} ({label}: {structured:.3g} Nm repeats every period, {noise:.3g} Nm does not; "
-        f"{100 * structured / max(torques[label], 1e-300):.2g} % of the torque, {limits[label]:.3g} Nm matters)",
+        f"F test p {corrected[label]:.2g} ({label}: {structured:.3g} {unit} repeats every period, "
+        f"{noise:.3g} {unit} does not; "
+        f"{100 * structured / max(torques[label], 1e-300):.2g} % of the torque, {limits[label]:.3g} {unit} matters)",
         "unmodelled physics; more data will not reduce it, an extended model will",
         p_value=corrected[label],
     )

@@ -394,7 +394,15 @@ def score_cad(model: DynamicModel, prepared: PreparedSession, session: Session) 
         return regressor.torque(chain, channel.q, channel.qd, channel.qdd, bodies)
 
     notes = ("CAD: the payload is not in the URDF.",) if payload_name(session) else ()
-    return score_session(prepared, predict, ("joint",), session, "CAD (URDF), no friction", notes=notes)
+    return score_session(
+        prepared,
+        predict,
+        ("joint",),
+        session,
+        "CAD (URDF), no friction",
+        notes=notes,
+        units=chain.torque_units,
+    )
 
 
 def score_controller_model(prepared: PreparedSession, session: Session) -> SessionScore | None:
@@ -454,4 +462,4 @@ def _score_other(
         )
     prepared = prepared_session(other, session, settings, blocks=not other.remembers)
     predict = predictor(other, mounted(other, session))
-    return score_session(prepared, predict, common, session, name)
+    return score_session(prepared, predict, common, session, name, units=other.structure.chain.torque_units)

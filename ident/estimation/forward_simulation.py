@@ -44,7 +44,7 @@ _ADVICE = (
 class ForwardSimulation(Tabular):
     """Simulated motion and torque beside the measured ones; prints itself.
 
-    times (N,) [s]; q, qd (N, n); torque (N, n) of `side`. measured_q, measured_torque (N, n).
+    times (N,) [s]; q, qd (N, n); torque (N, n) of `side`. measured_q, measured_torque (N, n). prismatic : by joint.
     """
 
     session: str
@@ -57,6 +57,7 @@ class ForwardSimulation(Tabular):
     torque: Floats
     measured_q: Floats
     measured_torque: Floats
+    prismatic: tuple[bool, ...]
 
     @property
     def torque_rms(self) -> Floats:
@@ -100,15 +101,19 @@ class ForwardSimulation(Tabular):
     def pieces(self) -> list[Piece]:
         """Title and table by joint."""
         rows = [
-            (joint, f"{torque:.3f}", f"{1e3 * position:.3f}")
-            for joint, torque, position in zip(
-                self.joint_names, self.torque_rms, self.position_rms, strict=True
+            (
+                joint,
+                f"{torque:.3f} {'N' if slides else 'Nm'}",
+                f"{1e3 * position:.3f} {'mm' if slides else 'mrad'}",
+            )
+            for joint, torque, position, slides in zip(
+                self.joint_names, self.torque_rms, self.position_rms, self.prismatic, strict=True
             )
         ]
         return [
             f"Forward simulation of {self.session}, {self.side} torque, along the {self.reference} motion: "
             f"simulated torque error {100 * self.relative:.2f} %",
-            Listing(("joint", "torque rms Nm", "position rms mrad"), rows),
+            Listing(("joint", "torque rms", "position rms"), rows),
         ]
 
     def __str__(self) -> str:
@@ -162,6 +167,7 @@ def simulate_session(
         torque=torque[settle],
         measured_q=measured[settle],
         measured_torque=resampled(channel.times, channel.torque, times)[settle],
+        prismatic=tuple(model.structure.chain.prismatic.tolist()),
     )
 
 

@@ -12,7 +12,7 @@ shrink with more data of the loaded arm.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -51,8 +51,9 @@ class PayloadEstimate(Tabular):
     cross : (10, p), covariance with the arm model's parameters.
     consistent : (10,) the nearest physically consistent body. exact : whether it is the estimate itself.
     announced_kg : mass in the session's metadata, None without.
-    residual : rms of the rows by joint and side [Nm].
-    offsets : estimated shifts of the torque offsets by joint [Nm], empty for fixed offsets.
+    residual : rms of the rows by joint and side [Nm], of a prismatic joint [N].
+    offsets : estimated shifts of the torque offsets by joint, empty for fixed offsets. torque_units : by the names of
+        `residual` and `offsets`.
     """
 
     payload: str
@@ -70,6 +71,7 @@ class PayloadEstimate(Tabular):
     residual: dict[str, float]
     offsets: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    torque_units: dict[str, str] = field(default_factory=dict)
 
     @property
     def std(self) -> Floats:
@@ -162,7 +164,7 @@ class PayloadEstimate(Tabular):
                 f"Payload {self.payload!r} of {self.robot} from {self.session}",
                 *self._mass_and_com,
                 f"  physically consistent: {'yes' if self.exact else 'no, see `consistent`'}; residual rms up to "
-                f"{max(self.residual.values()):.3f} Nm",
+                f"{self.largest_residual}",
             ]
         )
 
@@ -177,6 +179,22 @@ class PayloadEstimate(Tabular):
         ]
         return Listing(("", "estimate", "std", "of it arm", "consistent", "unit"), rows)
 
+    @property
+    def largest_residual(self) -> str:
+        """The largest rms of the residual, with its unit."""
+        key = max(self.residual, key=lambda name: self.residual[name])
+        return f"{self.residual[key]:.3f} {self.torque_units.get(key, 'Nm')}"
+
+    def _in_units(self, values: Mapping[str, float], form: str) -> str:
+        """Torques behind a title: the unit first if all have it, else behind each."""
+        units = [self.torque_units.get(key, "Nm") for key in values]
+        mixed = len(set(units)) > 1
+        shown = (
+            f"{key} {value:{form}}" + f" {unit}" * mixed
+            for (key, value), unit in zip(values.items(), units, strict=True)
+        )
+        return ("" if mixed else f" [{units[0]}]") + f": {', '.join(shown)}"
+
     def pieces(self) -> list[Piece]:
         """The table, mass and centre of mass, the consistent body, residuals and notes."""
         lines: list[Piece] = [
@@ -189,11 +207,10 @@ class PayloadEstimate(Tabular):
             *self._mass_and_com,
             f"  consistent body: {float(mass):.4f} kg, principal moments {moments} kg m^2"
             + (" (the estimate itself)" if self.exact else ""),
-            "  residual rms [Nm]: " + ", ".join(f"{key} {value:.3f}" for key, value in self.residual.items()),
+            f"  residual rms{self._in_units(self.residual, '.3f')}",
         ]
         if self.offsets:
-            shifts = ", ".join(f"{key} {value:+.3f}" for key, value in self.offsets.items())
-            lines.append(f"  offsets moved since the arm model by [Nm]: {shifts}")
+            lines.append(f"  offsets moved since the arm model by{self._in_units(self.offsets, '+.3f')}")
         return [*lines, *(f"  {note}" for note in self.notes)]
 
     def __str__(self) -> str:
@@ -282,6 +299,8 @@ def identify_payload(
         exact=found.exact,
         announced_kg=next((m for m in map(stated_mass, sessions) if m is not None), None),
         residual={fit.label: fit.rms for fit in fitted.classes},
+        torque_units={fit.label: fit.unit for fit in fitted.classes}
+        | {structure.names[c]: structure.units[c] for c in offset_columns},
         offsets={
             structure.names[c]: float(v) for c, v in zip(offset_columns, fitted.values[_BODY:], strict=True)
         },

@@ -29,7 +29,7 @@ from ident.dynamics.tables import Tabular
 from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepared import Passage, PreparedSession, TorqueChannel
 from ident.rows.sessions import payload_name
-from lwr_driver.listing import Listing, Piece, text_of
+from lwr_driver.listing import Piece, in_units, text_of
 from lwr_driver.notebook import subplots
 from lwr_driver.session import Session
 from lwr_driver.session.spool import Growing, release
@@ -54,7 +54,7 @@ def torque_error(measured: Floats, computed: Floats, used: NDArray[np.bool_] | N
 
 @dataclass(frozen=True)
 class Score:
-    """Residual (measured minus computed) of one joint and side in one session [Nm].
+    """Residual (measured minus computed) of one joint and side in one session [`unit`].
 
     samples : number of measured samples. rms, bias : root mean square and mean over all of them.
     relative : the joint's torque error, rms over rms of the torque.
@@ -62,10 +62,12 @@ class Score:
     moving_rms, moving_relative : the same, moving samples only.
     standstill, standstill_error : share of standstill in the samples and in the squared error.
     band_rms : rms in the band of the estimation. floor_rms : scatter between periods there, NaN without periods.
+    unit : of the torque, N for the force of a prismatic joint.
     """
 
     joint: str
     side: str
+    unit: str
     samples: int
     rms: float
     relative: float
@@ -167,7 +169,8 @@ class SessionScore(Tabular):
             axis.plot(trace.times, trace.measured[:, k], linewidth=0.8, label="measured")
             axis.plot(trace.times, trace.computed[:, k], linewidth=0.8, label=self.predictor)
             axis.set_ylabel(joint, fontsize="small")
-        head = f"{self.session}, payload {self.payload or 'none'}: {side} torque [Nm]"
+        units = " or ".join(dict.fromkeys(score.unit for score in self.scores))
+        head = f"{self.session}, payload {self.payload or 'none'}: {side} torque [{units}]"
         axes[0].set_title(head, fontsize="medium")
         axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small")
         axes[-1].set_xlabel("time [s]")
@@ -193,19 +196,19 @@ class SessionScore(Tabular):
         head = [
             "",
             "error %",
-            "rms Nm",
-            "bias Nm",
-            "worst Nm",
+            "rms {unit}",
+            "bias {unit}",
+            "worst {unit}",
             "at s",
-            "moving Nm",
+            "moving {unit}",
             "standstill %",
-            "in band Nm",
+            "in band {unit}",
         ]
         if any(math.isfinite(score.floor_rms) for score in self.scores):
-            head.append("floor Nm")
+            head.append("floor {unit}")
         return [
             f"{self.session}, payload {self.payload or 'none'}: {self.predictor}{label}",
-            Listing(head, [row[: len(head)] for row in rows]),
+            in_units(head, [row[: len(head)] for row in rows], [score.unit for score in self.scores]),
             *(f"  {line}" for line in (*self.sentences, *self.notes)),
         ]
 
@@ -283,8 +286,9 @@ def score_session(
     *,
     seen: bool = False,
     notes: tuple[str, ...] = (),
+    units: Sequence[str] = (),
 ) -> SessionScore:
-    """Residuals of any predictor in one session, per joint and side.
+    """Residuals of any predictor in one session, per joint and side. units : of the torques by joint, default Nm.
 
     Raises DataError when the session has no channel for any of the sides.
     """
@@ -325,7 +329,8 @@ def score_session(
         figures["standstill"][side] = 1.0 - _ratio(power[5], power[4])
         figures["standstill_error"][side] = 1.0 - _ratio(power[2], power[0])
         for k, joint in enumerate(prepared.joint_names):
-            scores.append(_score(joint, side, k, rows, times, columns[k], prepared))
+            unit = units[k] if units else "Nm"
+            scores.append(_score(joint, side, unit, k, rows, times, columns[k], prepared))
             release(*columns[k])
     if not scores:
         raise DataError(
@@ -393,6 +398,7 @@ def inside(channel: TorqueChannel, passage: Passage) -> NDArray[np.bool_]:
 def _score(
     joint: str,
     side: str,
+    unit: str,
     k: int,
     rows: Sequence[_Rows],
     times: Floats,
@@ -402,7 +408,7 @@ def _score(
     """times : (m,) of the samples."""
     error, _, used, moving = samples
     if not used.any():
-        return Score(joint, side, 0, *[math.nan] * 11)
+        return Score(joint, side, unit, 0, *[math.nan] * 11)
     e = error[used]
     worst = int(np.argmax(np.abs(e)))
     band = np.concatenate([r.band[r.valid[:, k], k] for r in rows])
@@ -410,6 +416,7 @@ def _score(
     return Score(
         joint=joint,
         side=side,
+        unit=unit,
         samples=len(e),
         rms=_rms(e),
         relative=math.sqrt(_ratio(power[0], power[1])),

@@ -47,28 +47,35 @@ _FELT, _SURE = 0.02, 2.0
 @dataclass(frozen=True)
 class Turning:
     """Entries of the drives whose friction turns over a path; before, after : torque error [%] of the motor side over
-    all samples looked at, without and with them; names : of the joints."""
+    all samples looked at, without and with them; names : of the joints; sliding : names of the prismatic ones."""
 
     entries: tuple[Mapping[str, Any], ...]
     before: float
     after: float
     names: tuple[str, ...]
+    sliding: tuple[str, ...] = ()
+
+    @property
+    def lengths(self) -> dict[str, float]:
+        """Paths by joint [rad, m of a prismatic one]."""
+        values = (entry["parameters"]["length"]["value"] for entry in self.entries)
+        return dict(zip(self.names, values, strict=True))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content for files."""
         return {
             "torque_error_percent": {"without": self.before, "with": self.after},
-            "length_rad": {
-                name: entry["parameters"]["length"]["value"]
-                for name, entry in zip(self.names, self.entries, strict=True)
-            },
+            "length_rad": {name: one for name, one in self.lengths.items() if name not in self.sliding},
+            "length_m": {name: one for name, one in self.lengths.items() if name in self.sliding},
         }
 
     def __str__(self) -> str:
-        lengths = (1e3 * entry["parameters"]["length"]["value"] for entry in self.entries)
-        listed = ", ".join(f"{name} {length:.2g}" for name, length in zip(self.names, lengths, strict=True))
+        listed = ", ".join(
+            f"{name} {1e3 * one:.2g} {'mm' if name in self.sliding else 'mrad'}"
+            for name, one in self.lengths.items()
+        )
         return (
-            f"friction turns over a path after a reversal [mrad]: {listed}; the model has it as an effect, motor "
+            f"friction turns over a path after a reversal: {listed}; the model has it as an effect, motor "
             f"torque error over all samples {self.before:.1f} -> {self.after:.1f} %"
         )
 
@@ -88,16 +95,18 @@ def friction_turning(
     if whole is None or len(whole.torque) < _LEAST_BLOCKS:
         return None
     coulomb = drive_coulomb(model, sensed=any(bool(s.joint.effort.shape[1]) for s in sessions))
+    chain = model.structure.chain
+    sliding = {name for name, slides in zip(chain.joint_names, chain.prismatic, strict=True) if slides}
     entries, names = [], []
     left = whole.error[0].sum(axis=0)
-    for joint, name in enumerate(model.structure.chain.joint_names):
+    for joint, name in enumerate(chain.joint_names):
         most = float(coulomb[joint])
         if most <= 0.0 or (share := whole.pays(joint, most)) is None:
             continue
         place, amplitude = whole.best(joint, most, share=share)
         stds = whole.scatter(joint, most)
         values = {"amplitude": (amplitude, stds[0]), "length": (float(_LENGTHS[place]), stds[1])}
-        entries.append(entry_of(PRESLIDING, [joint + 1], values))
+        entries.append(entry_of(PRESLIDING, [joint + 1], values, prismatic=name in sliding))
         names.append(name)
         left[joint] -= float(whole.fall(joint, place, amplitude).sum())
     if not entries:
@@ -106,7 +115,9 @@ def friction_turning(
         100.0 * float(np.sqrt(power.sum() / whole.torque.sum()))
         for power in (whole.error[0].sum(axis=0), left)
     )
-    return Turning(tuple(entries), before, after, tuple(names))
+    return Turning(
+        tuple(entries), before, after, tuple(names), tuple(name for name in names if name in sliding)
+    )
 
 
 def drive_coulomb(model: DynamicModel, *, sensed: bool) -> Floats:

@@ -30,7 +30,7 @@ from ident.rows.sessions import payload_name
 from ident.rows.shared_rows import from_marks, seen_before
 from ident.screening.doubts import Doubt, settle
 from ident.screening.screen import require_sound, screen
-from lwr_driver.listing import Listing, Piece, text_of
+from lwr_driver.listing import Listing, Piece, in_units, text_of
 from lwr_driver.session import Session, Sessions, as_sessions
 
 # Torque error on held-out data from which a model is of no use there.
@@ -137,14 +137,18 @@ class Validation(Tabular):
                 entries = [entry for entry in (own, *rivals) if side in entry.relative]
                 if len(entries) < 2:
                     continue
-                joints = [score.joint for score in own.scores if score.side == side]
+                units = {score.joint: score.unit for score in own.scores if score.side == side}
+                joints = list(units)
                 rows = []
                 for entry in entries:
                     values = {score.joint: score.rms for score in entry.scores if score.side == side}
                     row = [f"{values.get(joint, math.nan):.3f}" for joint in joints]
                     rows.append([entry.predictor, f"{100 * entry.relative[side]:.2f}", *row])
-                title = f"{own.session}, {side} side: torque error of all joints, rms by joint [Nm]"
-                found += ["", title, Listing(["predictor", "error %", *joints], rows)]
+                mixed = len(set(units.values())) > 1
+                title = f"{own.session}, {side} side: torque error of all joints, rms by joint"
+                title += "" if mixed else f" [{units[joints[0]]}]"
+                names = [f"{name} [{units[name]}]" if mixed else name for name in joints]
+                found += ["", title, Listing(["predictor", "error %", *names], rows)]
         return found
 
 
@@ -191,7 +195,10 @@ def validate(
             settle([doubt for doubt in doubts if doubt.certain and doubt.session in ("", session.path.name)])
             prepared = prepared_session(model, session, settings, blocks=not model.remembers)
             sides = model.structure.sides
-            scores.append(score_session(prepared, predict, sides, session, "identified model", seen=flag))
+            units = model.structure.chain.torque_units
+            scores.append(
+                score_session(prepared, predict, sides, session, "identified model", seen=flag, units=units)
+            )
         except LwrError as error:
             if not keep_going:
                 raise
@@ -215,8 +222,8 @@ def _poor(score: SessionScore) -> str:
     worst = max((one for one in score.scores if one.side == side), key=lambda one: one.rms)
     return (
         f"{score.session}: the {side} torque is off by {100.0 * error:.0f} %, most at {worst.joint} "
-        f"({worst.rms:.3g} Nm rms): the model does not hold there; another payload, a wrong channel, or a motion "
-        "beyond that of the estimate"
+        f"({worst.rms:.3g} {worst.unit} rms): the model does not hold there; another payload, a wrong channel, or a "
+        "motion beyond that of the estimate"
     )
 
 
@@ -322,7 +329,7 @@ class CrossValidation(Tabular):
 
     @property
     def rms(self) -> dict[str, float]:
-        """Root mean square over the folds of each joint and side [Nm], by `joint side`."""
+        """Root mean square over the folds of each joint and side [Nm or N], by `joint side`."""
         table: dict[str, list[float]] = {}
         for fold in self.scores:
             for score in fold.scores:
@@ -356,7 +363,8 @@ class CrossValidation(Tabular):
         for score in self.scores:
             found += ["", *score.pieces()]
         rows = [(key, f"{value:.3f}") for key, value in self.rms.items()]
-        found += ["", Listing(("over the folds", "rms Nm"), rows)]
+        units = {f"{score.joint} {score.side}": score.unit for fold in self.scores for score in fold.scores}
+        found += ["", in_units(("over the folds", "rms {unit}"), rows, [units[key] for key, _ in rows])]
         return [*found, *self.skipped, *(f"warning: {warning}" for warning in self.warnings)]
 
     def __str__(self) -> str:

@@ -15,7 +15,7 @@ from scipy import special
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular, rows_of
 from ident.estimators.problem import Problem
-from lwr_driver.listing import Listing, Piece, text_of
+from lwr_driver.listing import Listing, Piece, in_units, text_of
 from lwr_driver.notebook import subplots
 
 Value = TypeVar("Value", float, Floats)
@@ -44,7 +44,7 @@ class Covariance:
 class ClassFit:
     """Residual of one joint and side.
 
-    sigma : std of the rows with the correct degrees of freedom [Nm]. rms : plain root mean square [Nm].
+    sigma : std of the rows with the correct degrees of freedom [`unit`]. rms : plain root mean square [`unit`].
     parameters : share of the p parameters consumed by these rows (the trace of their part of the hat matrix).
     n_eff : effective number of independent rows under serial correlation.
     """
@@ -56,6 +56,7 @@ class ClassFit:
     sigma: float
     rms: float
     n_eff: float
+    unit: str = "Nm"
 
     @property
     def label(self) -> str:
@@ -187,7 +188,8 @@ class Estimate(Tabular):
             (c.label, f"{c.rows}", f"{c.n_eff:.0f}", f"{c.parameters:.1f}", f"{c.sigma:.4f}", f"{c.rms:.4f}")
             for c in self.classes
         ]
-        lines.append(Listing(("rows", "count", "n_eff", "consumed", "sigma Nm", "rms Nm"), classes, 0))
+        head = ("rows", "count", "n_eff", "consumed", "sigma {unit}", "rms {unit}")
+        lines.append(in_units(head, classes, [c.unit for c in self.classes], 0))
         lines += [f"note: {note}" for note in self.notes]
         if self.prior_only:
             lines.append(

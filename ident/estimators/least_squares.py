@@ -110,7 +110,7 @@ def estimate_from(
         rms = np.sqrt(square / max(rows, 1))
         fits.append(
             ClassFit(row_class.joint, row_class.side, rows, float(consumed[number]), float(sigma), float(rms),
-                     float(n_eff[number]))
+                     float(n_eff[number]), row_class.unit)
         )  # fmt: skip
     covariances = {"textbook": plain or textbook(bread)}
     by_class = weights if class_weights is None else class_weights

@@ -37,6 +37,7 @@ class RowGroup:
     time_index : (m,) int64, strictly increasing number of the output sample within its session; neighbours
         in time differ by one, excluded samples leave a gap.
     record : number of the session (or of an uninterrupted part of it); time runs on only within a record.
+    unit : of the torque, N for the force of a prismatic joint.
     """
 
     joint: str
@@ -45,6 +46,7 @@ class RowGroup:
     matrix: Floats
     target: Floats
     time_index: NDArray[np.int64]
+    unit: str = "Nm"
 
     def __post_init__(self) -> None:
         rows = self.target.shape
@@ -157,6 +159,7 @@ class RowClass:
     side: str
     groups: tuple[int, ...]
     factor: TriangularFactor
+    unit: str = "Nm"
 
     @property
     def label(self) -> str:
@@ -224,7 +227,7 @@ class Problem:
             factors.append(factor)
         whole = factors[0] if len(factors) == 1 else TriangularFactor.combine(factors, [1.0] * len(factors))
         first = self.groups[indices[0]]
-        return RowClass(first.joint, first.side, tuple(indices), whole)
+        return RowClass(first.joint, first.side, tuple(indices), whole, first.unit)
 
     @cached_property
     def class_of_group(self) -> tuple[int, ...]:

@@ -93,7 +93,7 @@ def observe(
     nuisances: list[Nuisance] = []
     for number, (session, payload) in enumerate(zip(sessions, payloads, strict=True)):
         slopes: dict[str, dict[int, Floats]] = {"motor": {}, "joint": {}}
-        by_side = {side: _Collected(session) for side in structure.sides}
+        by_side = {side: _Collected(session, structure.chain.torque_units) for side in structure.sides}
         for passage in session.passages:
             for side, rows in by_side.items():
                 part = _side(passage, side, structure, payload, chosen, session)
@@ -291,8 +291,8 @@ def _known_means(table, known, factor):  # type: ignore[no-untyped-def]
 class _Collected:
     """Rows of one side by joint, part after part; long matrices in files."""
 
-    def __init__(self, session: PreparedSession) -> None:
-        self._session = session
+    def __init__(self, session: PreparedSession, units: Sequence[str]) -> None:
+        self._session, self._units = session, units
         self._rows = [tuple(Growing() for _ in range(4)) for _ in session.joint_names]
 
     def add(self, part: _Part) -> None:
@@ -307,7 +307,7 @@ class _Collected:
         """Row group and slope of each joint with rows."""
         session = self._session
         average = session.settings.average_periods and session.period_rows is not None and session.periods > 1
-        for name, shelves in zip(session.joint_names, self._rows, strict=True):
+        for name, unit, shelves in zip(session.joint_names, self._units, self._rows, strict=True):
             if not len(shelves[1]):
                 continue
             matrix, target, slope, index = (shelf.array() for shelf in shelves)
@@ -316,7 +316,7 @@ class _Collected:
                     matrix, target, slope, index, session.period_rows, session.periods
                 )
             if len(target):
-                yield RowGroup(name, side, number, matrix, target, index), slope
+                yield RowGroup(name, side, number, matrix, target, index, unit), slope
 
 
 def _averaged(

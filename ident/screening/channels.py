@@ -31,12 +31,13 @@ _COPIED_S, _COPIED, _CHANGES = 1.0, 0.1, 20
 
 def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts about the channels of sessions with the joints of `chain`."""
-    found = [*_repeated(sessions), *never_moving(sessions), *dead_sensors(sessions)]
+    units = dict(zip(chain.joint_names, chain.torque_units, strict=True))
+    found = [*_repeated(sessions), *never_moving(sessions), *dead_sensors(sessions, units)]
     for session in sessions:
         found += [*_copied(session), *_both_sides(session)]
         frozen = list(frozen_channels(session))
         named = {(doubt.channel, doubt.joints) for doubt in frozen}
-        clipped = [doubt for doubt in saturated(session) if (doubt.channel, doubt.joints) not in named]
+        clipped = [doubt for doubt in saturated(session, units) if (doubt.channel, doubt.joints) not in named]
         found += [*_clocks(session), *frozen, *_jumps(session, chain), *clipped, *check_speeds(session)]
     return found
 

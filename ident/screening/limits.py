@@ -18,8 +18,9 @@ _OVER, _OUTLIERS = 1.1, 0.001
 def check_limits(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts by the limits in the URDF: a channel is wrong, seldom clear how."""
     limits, found = joint_limits(chain), list[Doubt]()
+    units = dict(zip(chain.joint_names, chain.torque_units, strict=True))
     for session in sessions:
-        beyond = list(_limits(session, limits))
+        beyond = list(_limits(session, limits, units))
         # A position in another unit is too fast as well.
         named = {name for doubt in beyond if doubt.channel == "position" for name in doubt.joints}
         rest = {name: limit for name, limit in limits.items() if name not in named}
@@ -50,7 +51,7 @@ def joint_limits(chain: Chain) -> dict[str, dict[str, float]]:
     return found
 
 
-def _limits(session: Session, limits: dict[str, dict[str, float]]) -> Iterator[Doubt]:
+def _limits(session: Session, limits: dict[str, dict[str, float]], units: dict[str, str]) -> Iterator[Doubt]:
     """Positions and torques against the limits of the URDF."""
     name, joint = session.path.name, session.joint
     for k, own in enumerate(session.joint_names):
@@ -72,8 +73,9 @@ def _limits(session: Session, limits: dict[str, dict[str, float]]) -> Iterator[D
                 size = float(np.quantile(np.abs(columns.effort[:, k]), 1.0 - _OUTLIERS))
                 over = size / limit["effort"]
                 if over > 3.0:
-                    seen = f"reaches {size:.4g} Nm, {over:.3g} times the limit of the URDF"
-                    looks = "mNm for Nm, or a gain" if over > 100.0 else "a unit or gain"
+                    unit = units.get(own, "Nm")
+                    seen = f"reaches {size:.4g} {unit}, {over:.3g} times the limit of the URDF"
+                    looks = f"m{unit} for {unit}, or a gain" if over > 100.0 else "a unit or gain"
                     yield Doubt(
                         channel, (own,), seen, looks, "state the unit when importing", over > 100.0, name
                     )

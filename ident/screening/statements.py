@@ -91,16 +91,20 @@ def _of_part(one: Explanation, sessions: Sequence[Session]) -> tuple[str, str, b
     if one.error is None:
         seen = f"contradicts {rest}" if len(one.joints) > 1 else f"is about {one.factor:g} times {rest}"
         return session, seen, len(one.joints) == 1 or one.drop > CERTAIN
-    value, std = one.error.value, one.error.std
+    value, std, unit = one.error.value, one.error.std, one.mended.chain.torque_units[one.joints[0]]
     if one.error.kind == "drift":
         way = "rises" if value > 0.0 else "falls"
-        return session, f"{way} by {abs(value):.3g} ± {std:.2g} Nm from start to end against {rest}", False
+        return (
+            session,
+            f"{way} by {abs(value):.3g} ± {std:.2g} {unit} from start to end against {rest}",
+            False,
+        )
     if one.error.kind == "zero":
         more = "higher" if value > 0.0 else "lower"
         either = ", or the other session's" if _is_either(one.parts, sessions) else ""
         return (
             session,
-            f"is {abs(value):.3g} ± {std:.2g} Nm {more} than {rest} (its zero is wrong{either})",
+            f"is {abs(value):.3g} ± {std:.2g} {unit} {more} than {rest} (its zero is wrong{either})",
             False,
         )
     gross = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)

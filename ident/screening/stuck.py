@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,8 +74,11 @@ def _others_stand(sessions: Sequence[Session], joint: int) -> bool:
     return all(np.sum(np.ptp(s.joint.position, axis=0) == 0.0) > 1 for s in sessions)
 
 
-def dead_sensors(sessions: Sequence[Session]) -> Iterator[Doubt]:
-    """Dead torque sensors; certain for a joint without any torque of the side, and for the motor side's delay."""
+def dead_sensors(sessions: Sequence[Session], units: Mapping[str, str]) -> Iterator[Doubt]:
+    """Dead torque sensors; certain for a joint without any torque of the side, and for the motor side's delay.
+
+    units : of the torques by joint.
+    """
     for session in sessions:
         for channel, columns in torques_of(session):
             motor = channel == "motor torque"
@@ -87,8 +90,10 @@ def dead_sensors(sessions: Sequence[Session]) -> Iterator[Doubt]:
                     mend = "repair the channel, or leave the motor torques aside (Model 1, `--model 1`)"
                 elif never:
                     mend = "repair the channel, add a session with it, or leave the joint torques aside"
-                seen = f"reads {float(columns.effort[0, joint]):.4g} Nm in every sample"
                 names = (session.joint_names[joint],)
+                seen = (
+                    f"reads {float(columns.effort[0, joint]):.4g} {units.get(names[0], 'Nm')} in every sample"
+                )
                 certain = motor or never
                 yield Doubt(
                     channel, names, seen, "a dead sensor", mend, certain, session.path.name, lost=True
@@ -214,15 +219,15 @@ def _abrupt(columns: JointColumns, joint: int, first: int, last: int) -> bool:
     return bool(len(usual) and jump > max(_SHARP * float(np.quantile(usual, 1.0 - _OUTLIERS)), STEP_RAD))
 
 
-def saturated(session: Session) -> Iterator[Doubt]:
-    """Channels that end at one value again and again."""
-    name = session.path.name
+def saturated(session: Session, units: Mapping[str, str]) -> Iterator[Doubt]:
+    """Channels that end at one value again and again. units : of the torques by joint."""
+    name, by_joint = session.path.name, [units.get(own, "Nm") for own in session.joint_names]
     mend = "move more gently or widen the sensor's range; the samples at the level are not the torque"
     if session.joint.effort.size:
         silent = set(dead(session.joint))
         for joint, level in enumerate(clipped_at(session.joint)):
             if np.isfinite(level) and joint not in silent:
-                seen = f"stays at its largest value, {level:.4g} Nm, again and again"
+                seen = f"stays at its largest value, {level:.4g} {by_joint[joint]}, again and again"
                 yield Doubt(
                     "joint torque", (session.joint_names[joint],), seen, "saturation", mend, False, name
                 )
@@ -234,7 +239,7 @@ def saturated(session: Session) -> Iterator[Doubt]:
             # A coarse sensor may repeat a value somewhere in its range; a limit is the end of the range.
             if stuck.joint not in silent and (share > _OFTEN or stuck.value in (own.min(), own.max())):
                 levels.setdefault(stuck.joint, []).append(
-                    f"{stuck.value:.4g} Nm ({100 * share:.0f} % of the motion)"
+                    f"{stuck.value:.4g} {by_joint[stuck.joint]} ({100 * share:.0f} % of the motion)"
                 )
         for joint, texts in levels.items():
             seen = f"stays at {' and '.join(texts)}"

@@ -67,13 +67,13 @@ def motion_figure(
     title = side.capitalize()
 
     def panel(k: int, joint: str) -> Panel:
-        mean = float(np.mean(np.abs(one.torque[:, k])))
+        mean, unit = float(np.mean(np.abs(one.torque[:, k]))), one.scores[k].unit
         marks = (
             _line("logged", "as logged", one.time, one.torque[:, k]),
             _line("measured", f"low-pass {one.cutoff_hz:g} Hz", one.grid, one.measured[:, k]),
         )
-        alt = f"{title} torque of {joint} over time, session {one.session}: mean magnitude {mean:.2f} Nm."
-        return Panel(joint, "time [s]", "torque [Nm]", marks, alt, f"mean |τ| {mean:.2f} Nm")
+        alt = f"{title} torque of {joint} over time, session {one.session}: mean magnitude {mean:.2f} {unit}."
+        return Panel(joint, "time [s]", f"torque [{unit}]", marks, alt, f"mean |τ| {mean:.2f} {unit}")
 
     name = f"torque-logged-{one.session}-{side}"
     return _by_joint(one, joints, name, f"{title} torques, session {one.session}", panel)
@@ -102,10 +102,11 @@ def torque_figure(
         )
         alt = (
             f"Measured and computed {one.side} torque of {joint}, session {one.session}: torque error "
-            f"{100 * score.relative:.2f} %, {score.rms:.3g} Nm rms."
+            f"{100 * score.relative:.2f} %, {score.rms:.3g} {score.unit} rms."
         )
-        note = f"torque error {100 * score.relative:.2f} %, {score.rms:.2g} Nm"
-        return Panel(joint, "time [s]", "torque [Nm]", marks, alt, note, lower_label="residual [Nm]")
+        note = f"torque error {100 * score.relative:.2f} %, {score.rms:.2g} {score.unit}"
+        torque, left = f"torque [{score.unit}]", f"residual [{score.unit}]"
+        return Panel(joint, "time [s]", torque, marks, alt, note, lower_label=left)
 
     kind = "held-out session" if one.unseen else "session"
     caption = f"Measured and computed {one.side} torque, {kind} {one.session}"
@@ -138,9 +139,10 @@ def residual_figure(
         )
         if against != "time":
             marks = _binned(one, residual[:, k], k, against)
-        note = f"{one.scores[k].rms:.3g} Nm rms, all samples"
+        unit = one.scores[k].unit
+        note = f"{one.scores[k].rms:.3g} {unit} rms, all samples"
         alt = f"Residual {one.side} torque of {joint} against {against}, session {one.session}: {note}."
-        return Panel(joint, labels[against], "residual [Nm]", marks, alt, note)
+        return Panel(joint, labels[against], f"residual [{unit}]", marks, alt, note)
 
     caption = f"Residual {one.side} torque against {against}, session {one.session}"
     return _by_joint(one, joints, f"residual-{against}-{one.session}-{one.side}", caption, panel)

@@ -92,7 +92,14 @@ def curves(
     payload = mounted(model, session)
     prepared = prepared_session(model, session, settings, blocks=not model.remembers)
     predict = predictor(model, payload)
-    scored = score_session(prepared, predict, model.structure.sides, session, "identified model")
+    scored = score_session(
+        prepared,
+        predict,
+        model.structure.sides,
+        session,
+        "identified model",
+        units=model.structure.chain.torque_units,
+    )
     chosen = session.select(model.structure.chain.joint_names)
     found = []
     for side in model.structure.sides:

@@ -221,9 +221,9 @@ def torque_section(results: ResultFolder) -> str:
     """Figure 3 for each session and side, with the numbers of the computed-torque test."""
     if not results.curves:
         return ""
-    head = (
-        "joint", "torque error %", "rms [Nm]", "bias [Nm]", "worst [Nm]", "at [s]", "moving samples only [Nm]",
-        "standstill, % of samples", "standstill, % of squared error", "in the band [Nm]", "repeatability floor [Nm]",
+    head: tuple[str, ...] = (
+        "joint", "torque error %", "rms", "bias", "worst", "at [s]", "moving samples only",
+        "standstill, % of samples", "standstill, % of squared error", "in the band", "repeatability floor",
     )  # fmt: skip
     if any(one.unseen for one in results.curves):
         origin = "The held-out motion is first."
@@ -246,10 +246,14 @@ def torque_section(results: ResultFolder) -> str:
             f"({results.curves[0].whole.band_hz:g} Hz); repeatability floor: scatter between the periods there."
         ),
     ]
+    units = {score.unit for one in results.curves for score in one.scores}
+    if len(units) == 1:
+        own = {"rms", "bias", "worst", "moving samples only", "in the band", "repeatability floor"}
+        head = tuple(f"{name} [{min(units)}]" if name in own else name for name in head)
     for index, one in enumerate(sorted(results.curves, key=lambda one: not one.unseen)):
         rows: list[list[Cell]] = [
             [
-                score.joint,
+                score.joint if len(units) == 1 else f"{score.joint} [{score.unit}]",
                 Number(100 * score.relative, ".2f"),
                 *(Number(v, ".3f") for v in (score.rms, score.bias, score.worst)),
                 Number(score.worst_time_s, ".2f"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lwr_driver.listing import Listing, text_of
+from lwr_driver.listing import Listing, in_units, text_of
 
 TABLE = Listing(
     ("joint", "error %", "rms Nm", "verdict"),
@@ -30,6 +30,14 @@ def test_columns_without_room_follow_behind_the_first_one() -> None:
         ["joint", "verdict"],
     ]
     assert [row[0] for part in parts for row in part.rows] == ["A1 joint", "E1"] * 3
+
+
+def test_rows_of_several_units_have_them_in_a_column() -> None:
+    head, rows = ("joint", "rms {unit}", "bias [{unit}]"), [("A1", "0.1", "0.0"), ("z", "3.1", "0.2")]
+    assert in_units(head, rows, ["N", "N"]) == Listing(["joint", "rms N", "bias [N]"], rows)
+    mixed = in_units(head, rows, ["Nm", "N"])
+    assert mixed.head == ["joint", "rms", "bias", "unit"]
+    assert mixed.rows == [["A1", "0.1", "0.0", "Nm"], ["z", "3.1", "0.2", "N"]]
 
 
 @pytest.mark.parametrize("width", [1, 10, 30, 200])

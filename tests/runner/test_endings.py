@@ -59,6 +59,21 @@ def test_the_torque_error_is_that_of_the_worst_session_and_of_held_out_ones_wher
 
 
 @pytest.mark.parametrize(
+    ("slides", "words"),
+    [
+        ({"z": 2.04e-4}, "of 2 drives turns over 3 mrad and 0.2 mm, in the model: "),
+        ({"z": 1e-3, "y": 2e-3}, "of 3 drives turns over 3 mrad and 1 to 2 mm, in the model: "),
+    ],
+)
+def test_lengths_of_sliding_joints_are_told_in_millimetres(slides: dict[str, float], words: str) -> None:
+    error = {"without": 5.2, "with": 4.9}
+    turning = {"length_rad": {"A1": 3e-3}, "length_m": slides, "torque_error_percent": error}
+    choice = {"chosen": "wls", "used": "wls", "candidates": [{"title": "wls", "held_back_percent": 1.0}]}
+    told = dict(numbers_of({"sessions": [], "choice": choice | {"friction_turns": turning}}))["friction"]
+    assert told.startswith(words)
+
+
+@pytest.mark.parametrize(
     ("lengths", "words"),
     [
         ({"A1": 2.04e-3, "A2": 0.104}, "of 2 drives turns over 2 to 100 mrad, in the model: "),

@@ -39,10 +39,14 @@ def channel(
     return TorqueChannel("motor", times, q, qd, 0.0 * q, torque, off, off, None, 2e-3)
 
 
-def told(one: TorqueChannel, monkeypatch: pytest.MonkeyPatch) -> turning.Turning | None:
+def told(
+    one: TorqueChannel, monkeypatch: pytest.MonkeyPatch, prismatic: tuple[bool, bool] = (False, False)
+) -> turning.Turning | None:
     model: Any = SimpleNamespace(
         structure=SimpleNamespace(
-            sides=("motor", "joint"), coulomb=Coulomb(), chain=SimpleNamespace(joint_names=("one", "two"))
+            sides=("motor", "joint"),
+            coulomb=Coulomb(),
+            chain=SimpleNamespace(joint_names=("one", "two"), prismatic=prismatic),
         ),
         drive=lambda: {"Fcm": np.full(2, FRICTION), "Fcl": np.zeros(2)},
         torque=lambda q, qd, qdd, **_: FRICTION * np.sign(qd),
@@ -51,6 +55,19 @@ def told(one: TorqueChannel, monkeypatch: pytest.MonkeyPatch) -> turning.Turning
     used = np.ones(one.torque.shape, dtype=bool)
     monkeypatch.setattr(turning, "_channels", lambda *_: [(one, used, None)])
     return friction_turning(model, [session])
+
+
+def test_the_path_of_a_sliding_joint_is_in_metres_and_its_friction_in_newtons(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    slides = channel(lambda q, _: FRICTION * dahl(np.ascontiguousarray(q), LENGTH, 1.0))
+    found = told(slides, monkeypatch, (False, True))
+    assert found is not None
+    assert found.to_dict()["length_m"] == found.lengths
+    assert not found.to_dict()["length_rad"]
+    assert "two 2.9 mm;" in str(found)
+    units = {name: one["unit"] for name, one in found.entries[0]["parameters"].items()}
+    assert (units["amplitude"], units["length"]) == ("N", "m")
 
 
 def test_the_length_is_found_in_the_drive_that_has_one(monkeypatch: pytest.MonkeyPatch) -> None:
