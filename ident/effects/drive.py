@@ -564,6 +564,10 @@ class ScaleError(Effect):
         return [f"reads {quantity_text(100.0 * abs(error), 100.0 * std, '1')} % too {much}"]
 
 
+# Standard deviations from which a growth is told.
+_CLEAR = 2.0
+
+
 class _Constant(Form):
     SATURATING = "saturating", "error", "cubic"
 
@@ -606,6 +610,9 @@ class MotorTorqueGain(ScaleError):
         )
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
-        """The error, and its growth."""
-        more = [] if form is None else [f"growing with the torque squared, {quantity(values['cubic'])}"]
-        return [*super().sentence(values, form, names), *more]
+        """The error, and its growth where it is clear."""
+        found = super().sentence(values, form, names)
+        value, std, _ = values.get("cubic", (0.0, 0.0, ""))
+        if abs(value) > _CLEAR * std:
+            found.append(f"growing with the torque squared, {quantity(values['cubic'])}")
+        return found

@@ -346,3 +346,9 @@ def test_parameters_are_put_into_words(
     units = {p.name: p.unit for p in EFFECTS[cause].parameters}
     given = {name: (float(value), 0.01, units[name]) for name, value in values.items()}
     assert said in described(cause, given, form, NAMES)
+
+
+@pytest.mark.parametrize(("cubic", "told"), [(2.9e-7, False), (5.5e-6, True)])
+def test_the_growth_of_a_torque_constants_error_is_told_where_it_is_clear(cubic: float, told: bool) -> None:
+    given = {"error": (0.045, 0.007, "1"), "cubic": (cubic, 6.7e-7, "1/Nm^2")}
+    assert ("growing" in described("motor_torque_gain", given, "saturating", NAMES)) == told
