@@ -13,7 +13,7 @@ from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, doubted
 from ident.diagnosis.evidence import Floats
 from ident.diagnosis.extension import Member, extension, power_left, title, titles
-from ident.diagnosis.findings import in_order, limit_findings, loss_finding
+from ident.diagnosis.findings import in_order, limit_findings, loss_finding, sizeless
 from ident.diagnosis.held_out import HeldOut, held_out, worse_rows
 from ident.diagnosis.models import changes_of, fitted_models, lasting, without_harm
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
@@ -40,11 +40,13 @@ def conclude(task: Task, state: State) -> Diagnosis:
     evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])
     remainders = find_remainders(bench.dictionary, evidence, settings, task.limits)
     findings = doubted(task, state, kept, remainders)
-    doubts = [f for f in findings if not believable(f.grounds)]
+    compared = task.reference is not None
+    believed = [believable(f.grounds) and not (compared and sizeless(f)) for f in findings]
+    doubts = [f for f, is_one in zip(findings, believed, strict=True) if not is_one]
     if doubts:
         # A name hardly believed is no finding; what it explained is left to the remainders.
-        kept = [one for one, f in zip(kept, findings, strict=True) if believable(f.grounds)]
-        findings = [f for f in findings if believable(f.grounds)]
+        kept = [one for one, is_one in zip(kept, believed, strict=True) if is_one]
+        findings = [f for f, is_one in zip(findings, believed, strict=True) if is_one]
         evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])
         remainders = find_remainders(bench.dictionary, evidence, settings, task.limits)
     worn = []

@@ -19,8 +19,11 @@ from ident.diagnosis.selection import Claim
 from ident.diagnosis.task import State, Task
 from ident.diagnosis.tolerances import usual_change
 from ident.dynamics.parameters import joint_unit
-from ident.effects import LOST_SAMPLES, SENSOR_SATURATION
+from ident.effects import EFFECTS, LOST_SAMPLES, SENSOR_SATURATION
 from ident.rows.data_quality import SampleLoss
+
+# Standard deviations of a size from zero, 95 %.
+_TOLD = 2.0
 
 
 def finding_of(claim: Claim, bench: DiagnosisBench, without: HeldOut, after: HeldOut, seed: int) -> Finding:
@@ -120,6 +123,17 @@ def timing_finding(
         effect.tell_apart,
         claim.gain,
     )
+
+
+def sizeless(finding: Finding) -> bool:
+    """Whether no parameter that its torque is proportional to is told from zero: its torque is there beyond chance, but
+    a time constant or a shape trades with its size, or its parts cancel. That is no change of an arm. Look-alikes have
+    a size between them."""
+    sizes = [
+        finding.parameters[p.name] for p in EFFECTS[finding.cause].linear if p.name in finding.parameters
+    ]
+    known = any(abs(one.value) > _TOLD * one.std for one in sizes)
+    return bool(sizes) and not known and not finding.alternatives
 
 
 def in_order(findings: Sequence[Finding], floor: Mapping[str, Floats]) -> list[Finding]:

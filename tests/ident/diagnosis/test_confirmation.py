@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,8 @@ import pytest
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.confirmation import _refuted
 from ident.diagnosis.evidence import Score
-from ident.diagnosis.result import Evident, Finding
+from ident.diagnosis.findings import sizeless
+from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.selection import Claim
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import EFFECTS, Shape
@@ -44,3 +46,31 @@ def test_a_sure_fall_needs_no_size_and_the_larger_part_below_zero_refutes() -> N
 def test_held_out_data_refute_no_event_and_nothing_that_they_hardly_excite() -> None:
     assert not refuted(0.1, (-10.0, 10.0), cause="contact")
     assert not refuted(0.1, (-10.0, 10.0), hardly=True)
+
+
+@pytest.mark.parametrize(
+    ("cause", "sizes", "told"),
+    [
+        ("friction_temperature", {"change": (-0.3, 3.1), "time_constant": (283.0, 3000.0)}, False),
+        (
+            "cable_spring",
+            {"stiffness": (0.06, 0.05), "quadratic": (-0.04, 0.03), "cubic": (0.009, 0.005)},
+            False,
+        ),
+        (
+            "cable_spring",
+            {"stiffness": (0.06, 0.01), "quadratic": (-0.04, 0.03), "cubic": (0.009, 0.005)},
+            True,
+        ),
+        # Its one parameter is a shape.
+        ("joint_torque_delay", {"delay": (0.0005, 0.001)}, True),
+    ],
+)
+def test_a_cause_of_no_size_is_no_finding(
+    cause: str, sizes: dict[str, tuple[float, float]], told: bool
+) -> None:
+    values = {name: Value(*size, "1") for name, size in sizes.items()}
+    evident = Evident(0.0, 1e-9, 0.1, 0.09, (0.0, 0.0), ())
+    finding = Finding(cause, "motor", (1,), values, evident, 0.9, (), "", 50.0)
+    assert sizeless(finding) != told
+    assert not sizeless(replace(finding, alternatives=(("contact", (), -40.0),)))
