@@ -20,6 +20,7 @@ from ident.rows.filters import SignalSettings
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import prepare
 from ident.rows.prepared import PreparedSession
+from ident.rows.signal_choice import for_delays
 from ident.screening.screen import without_dead
 from lwr_driver.session import Session
 
@@ -31,7 +32,7 @@ _DELAY_STEPS = 4
 _TOGETHER = 4
 # Change of a delay between two of them that is none, in standard deviations.
 _SETTLED = 0.3
-# Change of a delay that rows do not feel, as a share of the time between them: 0.2 ms for rows of the paper's 2 Hz.
+# Change of a delay that rows do not feel, as a share of the time between them: 0.08 ms for rows of 5 Hz.
 _FELT = 1e-3
 
 
@@ -148,9 +149,9 @@ def with_delays(
     """
     setting = {"joint": "joint_delay_s", "motor": "motor_delay_s"}
 
-    def at(number: int, delay_s: float) -> SessionRows:
+    def at(number: int, settings: SignalSettings, delay_s: float) -> SessionRows:
         stated: dict[str, Any] = {setting[made[number].side]: delay_s}
-        return make(*of[number], signals=replace(signals, **stated))
+        return make(*of[number], signals=replace(settings, **stated))
 
     untold = [
         k
@@ -160,8 +161,13 @@ def with_delays(
     found = list(made)
     for first in range(0, len(untold), _TOGETHER):
         some = untold[first : first + _TOGETHER]
-        told = _told([made[k] for k in some], [partial(at, k) for k in some])
-        for k, rows in zip(some, told, strict=True):
+        motor = any(made[k].side == "motor" for k in some)
+        wide = for_delays([of[k][0] for k in some], signals, motor=motor)
+        told = _told([partial(at, k, wide) for k in some])
+        for k, delay in zip(some, told, strict=True):
+            if delay is None:
+                continue
+            rows = (at(k, signals, delay.seconds) if delay.seconds else made[k]).late(delay)
             found[k] = rows if late_positions else rows.doubted()
             logger.info("%s: %s torques %s", rows.prepared.name, rows.side, rows.delay)
     return found
@@ -188,32 +194,37 @@ def apart_in_time(made: Sequence[SessionRows]) -> list[SessionRows]:
     ]
 
 
-def _told(made: Sequence[SessionRows], at: Sequence[Callable[[float], SessionRows]]) -> list[SessionRows]:
-    """The rows of some sessions with their delays, each step from rows at the delays before. at : rows at a delay."""
-    found, sides = list(made), {k: one.side for k, one in enumerate(made)}
-    delays: dict[int, Delay] = {}
+def _told(at: Sequence[Callable[[float], SessionRows]]) -> list[Delay | None]:
+    """The delays of some sessions, each step from rows at the delays before; None where no row tells one.
+
+    at : rows of each at a delay [s].
+    """
+    made = [one(0.0) for one in at]
+    found, sides = list(made), {k: one.side for k, one in enumerate(made) if one.delay is not None}
+    told: list[Delay | None] = [None] * len(made)
     for _ in range(_DELAY_STEPS):
         now = {k: one.delay.seconds for k, one in enumerate(found) if one.delay is not None}
         try:
             delays = delays_from_model(stack([one.problem for one in found]), sides, now)
         except DataError as error:
             logger.info("no delay from the base model: %s", error)
-            return found
+            return told
         moving = False
         for k, delay in delays.items():
             rest = delay.seconds - now[k]
             if abs(rest) > max(_SETTLED * delay.std, _FELT * found[k].prepared.row_time_s):
-                moving, found[k] = True, at[k](delay.seconds).late(delay)
+                moving, found[k], told[k] = True, at[k](delay.seconds), delay
             else:
                 std = float(np.hypot(delay.std, rest))
-                found[k] = found[k].late(replace(delay, seconds=now[k], std=std))
+                told[k] = replace(delay, seconds=now[k], std=std)
         if not moving:
             break
-    if any(delay.seconds for delay in delays.values()):
+    if any(delay is not None and delay.seconds for delay in told):
         after, before = (stack([one.problem for one in rows]) for rows in (found, made))
         if not fits_better(after, before, sides):
-            for k, delay in delays.items():
-                std = float(np.hypot(delay.std, delay.seconds))
-                none = replace(delay, seconds=0.0, std=std, how="with it no row fits better")
-                found[k] = made[k].late(none)
-    return found
+            none = "with it no row fits better"
+            told = [
+                delay and replace(delay, seconds=0.0, std=float(np.hypot(delay.std, delay.seconds)), how=none)
+                for delay in told
+            ]
+    return told

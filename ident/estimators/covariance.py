@@ -223,7 +223,7 @@ def jackknife(
         matrix = matrix * np.outer(ratio, ratio)
         how = ", moderated"
     if correlation is not None:
-        own, other = np.sqrt(np.diag(matrix)), np.sqrt(np.diag(correlation))
+        own, other = np.sqrt(np.diag(matrix)), np.sqrt(np.maximum(np.diag(correlation), 0.0))
         ratio = own / np.where(other > 0, other, 1.0)
         matrix = correlation * np.outer(ratio, ratio)
     kind = (

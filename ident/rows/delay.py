@@ -306,7 +306,7 @@ def delays_from_model(
     wide = replace(problem, names=names, groups=tuple(groups), units=(), nuisances=())
     # What the motion does not show of the base parameters has no part in the delays.
     shown = _shown(wide)
-    fit = WeightedLeastSquares(CovarianceSettings("hac")).fit(wide.select(shown))
+    fit = WeightedLeastSquares().fit(wide.select(shown))
     rows = {places[column - base]: row for row, column in enumerate(shown) if column >= base}
     found = {}
     for record, side in sides.items():

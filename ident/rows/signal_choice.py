@@ -50,6 +50,7 @@ from ident.rows.class_rows import (
 )
 from ident.rows.content import Kept, Recall
 from ident.rows.data_quality import passed_band
+from ident.rows.delay import DELAY_HZ
 from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass
 from ident.rows.prepare import prepare
 from ident.rows.reversals import TURNING_RAD
@@ -178,6 +179,34 @@ def _excerpt(session: Session, longest_s: float) -> Session:
     return replace(session, joint=session.joint.rows(start, stop), motor=motor)
 
 
+def for_delays(sessions: Sequence[Session], settings: SignalSettings, *, motor: bool) -> SignalSettings:
+    """Settings of rows that tell the delay of their torques: all cut-offs as many times higher as the band of the rows
+    is below that of a delay, as far as the recordings carry it.
+
+    A delay turns the phase, and more so the faster the motion, while friction that no row has right is slow. And the
+    positions' low-pass smears the jump of the acceleration at a reversal over the time of a swing of its cut-off, far
+    beyond what is left out there: at 5 Hz, torques look milliseconds early or late.
+    """
+    parts = [_excerpt(session, _MOST_S / len(sessions)) for session in sessions]
+    limit = NYQUIST_SHARE * min(1.0 / session.joint.period_s for session in parts)
+    band = _passed(parts, motor)
+    widest = min(DELAY_HZ, limit / 1.5, np.inf if band is None else 0.5 * band)
+    factor = max(widest / settings.decimate, 1.0)
+    cutoff = max(min(factor * settings.cutoff, limit), settings.cutoff)
+    return replace(settings, decimate_hz=factor * settings.decimate, cutoff_hz=cutoff)
+
+
+def _passed(sessions: Sequence[Session], motor: bool) -> float | None:
+    """Upper edge of an earlier low-pass on the torques [Hz], None without."""
+    edges = [
+        passed_band(channel.effort, channel.period_s)
+        for session in sessions
+        for channel in (session.joint, session.motor if motor else None)
+        if channel is not None
+    ]
+    return min((edge for edge in edges if edge is not None), default=None)
+
+
 def _with_decimation(
     settings: SignalSettings,
     sessions: Sequence[Session],
@@ -187,13 +216,7 @@ def _with_decimation(
     recall: Recall,
 ) -> tuple[SignalSettings, float | None]:
     """With the band of the rows; and the upper edge of an earlier low-pass on the torques [Hz], None without."""
-    edges = [
-        passed_band(channel.effort, channel.period_s)
-        for session in sessions
-        for channel in (session.joint, session.motor if motor else None)
-        if channel is not None
-    ]
-    band = min((edge for edge in edges if edge is not None), default=None)
+    band = _passed(sessions, motor)
     if settings.decimate_hz is not None:
         return settings, band
     stated = settings.punctual

@@ -17,7 +17,7 @@ from ident.estimators.problem import Problem
 from ident.rows.delay import Delay, delays_from_model, shared_delay
 from ident.screening.doubts import MEND_TIME, Doubt
 from lwr_driver.session import Session
-from tests.ident.estimation_arm import Sensors, chain, session, true_base
+from tests.ident.estimation_arm import Sensors, chain, drive, fourier, session, torques, true_base
 
 session_rows = importlib.import_module("ident.estimation.session_rows")
 delay_module = importlib.import_module("ident.rows.delay")
@@ -66,6 +66,45 @@ def test_a_punctual_channel_is_not_late_and_its_interval_is_in_the_deviations() 
     assert all(delay is not None and delay.seconds == 0.0 and delay.std > 0.0 for delay in delays)
     place = found.base.names.index("Ia4")
     assert found.estimate.std[place] > known.estimate.std[place]
+
+
+def pulled(late_s: float, seed: int) -> Session:
+    """Motor torques alone of an arm whose drives give way to the jump of their friction at each reversal."""
+    whole, step, pull = alone(0.0, seed), 1e-3, drive("Fcm") / drive("Ia")
+    periods, run_in_s = 10.0, 3.0
+    times = np.arange(round(whole.duration_s / step) + 1) * step
+    states = np.stack(fourier(times - run_in_s, periods, 5))
+    # A controller of 3 Hz holds the motors against it.
+    apart, rate = np.zeros((2, 7))
+    for q, qd, qdd in states.swapaxes(0, 1):
+        change = -(20.0**2) * apart - 32.0 * rate - pull * np.sign(qd + rate)
+        q += apart
+        qd += rate
+        qdd += change
+        apart, rate = apart + step * rate + 0.5 * step**2 * change, rate + step * change
+    random = np.random.default_rng(seed)
+    place = np.rint(np.arange(len(whole.joint)) * whole.joint.period_s / step).astype(np.int64)
+    effort = torques(*states, False)[1][np.maximum(place - round(late_s / step), 0)]
+    assert whole.motor is not None
+    joint = replace(whole.joint, position=states[0][place] + 1e-5 * random.normal(size=effort.shape))
+    motor = replace(
+        whole.joint,
+        topic="/motor_states",
+        position=effort[:, :0],
+        effort=effort + 0.3 * random.normal(size=effort.shape),
+    )
+    return replace(whole, joint=joint, motor=motor)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.008])
+def test_a_drive_that_gives_way_at_reversals_looks_neither_late_nor_early(late_s: float) -> None:
+    signals = replace(SETTINGS.signals, cutoff_hz=5.0, decimate_hz=2.0, reversal_s=0.1)
+    found = identify([pulled(late_s, 1)], chain(), replace(SETTINGS, signals=signals))
+    delay = found.prepared[0].delay
+    assert delay is not None
+    assert found.prepared[0].cutoff_hz == 5.0
+    assert delay.estimate == pytest.approx(late_s, abs=3.0 * delay.std)
+    assert 0.0 < delay.std < 1e-3
 
 
 def sensed(
