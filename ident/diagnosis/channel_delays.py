@@ -70,14 +70,14 @@ def common_delays(sets: Sequence[Mapping[str, Sequence[Delay]]]) -> dict[str, fl
 
 def sides_apart(
     sessions: Sequence[Session], arm: NominalArm, settings: DiagnosisSettings, reference: Reference
-) -> frozenset[str]:
-    """Channels whose delay is not that of the healthy arm.
+) -> dict[str, tuple[float, float]]:
+    """Channels whose delay is not that of the healthy arm, with the difference and its standard deviation [s].
 
     In all rows friction that turns over another length looks late as well, so a gain there has to be more than on
     healthy days; these rows tell the two apart. The probability is that of Student's distribution, since the healthy
     delays' standard deviation comes from few days.
     """
-    found = set()
+    found = {}
     for side, told in channel_delays(sessions, arm, settings).items():
         if not told:
             continue
@@ -85,8 +85,8 @@ def sides_apart(
         apart = mean - (arm.motor_delay_s if side == "motor" else arm.joint_delay_s)
         variance = (chi * std) ** 2 + reference.delay_std_s.get(side, DELAY_STD_S) ** 2
         if fisher_tail(apart**2 / variance, 1, USUAL_DAYS + max(reference.sets, 1) - 1) < ONE_IN:
-            found.add(side)
-    return frozenset(found)
+            found[side] = apart, chi * std
+    return found
 
 
 def mean_of(delays: Sequence[Delay]) -> tuple[float, float, float]:

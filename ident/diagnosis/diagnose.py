@@ -197,7 +197,7 @@ def _first(task: Task, bench: DiagnosisBench) -> State:
 def _in_time(task: Task, state: State) -> State:
     """The same with late channels shifted in time, and findings of them."""
     late = _late(state.selection)
-    slow = {c.trial.candidate.cause: _at_low_speeds(state.bench, c) for c in late}
+    slow = {c.trial.candidate.cause: _elsewhere(task, state.bench, c) for c in late}
     doubtful = [
         c.trial.candidate.cause
         for c in late
@@ -332,8 +332,12 @@ def _own_delay(claim: Claim, limit: float) -> str:
     )
 
 
-def _at_low_speeds(bench: DiagnosisBench, claim: Claim) -> tuple[float, float]:
-    """Delay of a late channel in slow rows and its standard deviation [s]."""
+def _elsewhere(task: Task, bench: DiagnosisBench, claim: Claim) -> tuple[float, float]:
+    """Delay of a late channel and its standard deviation [s] in rows away from reversals, where these tell one, for
+    friction that turns has no part in them; else in slow rows."""
+    told = task.apart.get(claim.trial.candidate.effect.channel or "")
+    if told is not None:
+        return told
     bench.evidence.replace([])
     return slow_delay(bench, claim.trial)
 

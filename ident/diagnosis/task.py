@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -31,7 +31,8 @@ class Task:
     """The input of a diagnosis, see `diagnose`. sessions, test : as given. arm : the nominal arm.
 
     causes : names to consider, None for all. model : the present model, None for the base model. sound : whether no
-    channel is broken. apart : channels whose delay is clearly not the healthy arm's.
+    channel is broken. apart : channels whose delay is clearly not the healthy arm's, with the
+    difference and its standard deviation [s].
     """
 
     sessions: Sequence[Session]
@@ -44,7 +45,7 @@ class Task:
     model: DynamicModel | None
     simulate: Simulate | None
     sound: bool = True
-    apart: frozenset[str] = frozenset()
+    apart: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def everything(self) -> list[Session]:

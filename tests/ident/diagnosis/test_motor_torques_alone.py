@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -102,6 +103,26 @@ def test_another_length_of_these_days_is_no_finding(
     turning = [e for e in found.base_model.effects if e["cause"] == PRESLIDING.cause]
     (length,) = (parameter_values(entry)["length"] for entry in turning if entry["joints"] == [2])
     assert length == pytest.approx(LENGTH * longer, rel=0.1)
+
+
+def test_a_late_channel_is_held_against_rows_away_from_reversals_where_these_tell_it(
+    make: Make, chain: Chain, reference: Reference, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def later(s: Signals) -> None:
+        turned()(s)
+        for torque in s["motor"].T:
+            torque[:] = np.interp(s["time"] - 0.008, s["time"], torque)
+
+    made = [make("a.mcap", 71, later), make("b.mcap", 72, later, 1)]
+    bare = [replace(s, joint=replace(s.joint, effort=s.joint.effort[:, :0])) for s in made]
+    # Slow rows have reversals in them, with friction of the day that turns in another way.
+    monkeypatch.setattr(
+        importlib.import_module("ident.diagnosis.diagnose"), "slow_delay", lambda *_: (0.014, 1e-4)
+    )
+    (found,) = diagnose(bare, chain, reference=reference).findings
+    assert found.cause == "motor_torque_delay"
+    assert found.parameters["delay"].value == pytest.approx(0.008, abs=3e-4)
+    assert found.confidence > 0.9
 
 
 def test_friction_is_compared_with_that_of_sessions_with_the_same_torques(chain: Chain) -> None:
