@@ -127,13 +127,15 @@ def timing_finding(
 
 def sizeless(finding: Finding) -> bool:
     """Whether no parameter that its torque is proportional to is told from zero: its torque is there beyond chance, but
-    a time constant or a shape trades with its size, or its parts cancel. That is no change of an arm. Look-alikes have
-    a size between them."""
-    sizes = [
-        finding.parameters[p.name] for p in EFFECTS[finding.cause].linear if p.name in finding.parameters
-    ]
-    known = any(abs(one.value) > _TOLD * one.std for one in sizes)
-    return bool(sizes) and not known and not finding.alternatives
+    a time constant or a shape trades with its size, or its parts cancel. That is no change of an arm.
+
+    Look-alikes have a size between them, and so have the ways of a friction to reverse, beside which one is estimated.
+    """
+    effect = EFFECTS[finding.cause]
+    if finding.alternatives or effect.beside_companions:
+        return False
+    sizes = [finding.parameters[p.name] for p in effect.linear if p.name in finding.parameters]
+    return bool(sizes) and not any(abs(one.value) > _TOLD * one.std for one in sizes)
 
 
 def in_order(findings: Sequence[Finding], floor: Mapping[str, Floats]) -> list[Finding]:
