@@ -202,7 +202,8 @@ def _in_time(task: Task, state: State) -> State:
         c.trial.candidate.cause
         for c in late
         if not (
-            _late_at_all_speeds(c, *slow[c.trial.candidate.cause]) and _late_in_all_joints(state.bench, c)
+            _late_at_all_speeds(c, *slow[c.trial.candidate.cause])
+            and (_told_apart(task, c) is not None or _late_in_all_joints(state.bench, c))
         )
     ]
     if doubtful:
@@ -332,10 +333,16 @@ def _own_delay(claim: Claim, limit: float) -> str:
     )
 
 
+def _told_apart(task: Task, claim: Claim) -> tuple[float, float] | None:
+    """Delay of a late channel beyond the healthy one and its standard deviation [s] in rows away from reversals, in
+    which joints agree; None where these tell none."""
+    return task.apart.get(claim.trial.candidate.effect.channel or "")
+
+
 def _elsewhere(task: Task, bench: DiagnosisBench, claim: Claim) -> tuple[float, float]:
     """Delay of a late channel and its standard deviation [s] in rows away from reversals, where these tell one, for
     friction that turns has no part in them; else in slow rows."""
-    told = task.apart.get(claim.trial.candidate.effect.channel or "")
+    told = _told_apart(task, claim)
     if told is not None:
         return told
     bench.evidence.replace([])

@@ -115,10 +115,10 @@ def test_a_late_channel_is_held_against_rows_away_from_reversals_where_these_tel
 
     made = [make("a.mcap", 71, later), make("b.mcap", 72, later, 1)]
     bare = [replace(s, joint=replace(s.joint, effort=s.joint.effort[:, :0])) for s in made]
-    # Slow rows have reversals in them, with friction of the day that turns in another way.
-    monkeypatch.setattr(
-        importlib.import_module("ident.diagnosis.diagnose"), "slow_delay", lambda *_: (0.014, 1e-4)
-    )
+    # Slow rows have reversals in them, with friction of the day that turns in another way, and so has each joint.
+    module = importlib.import_module("ident.diagnosis.diagnose")
+    monkeypatch.setattr(module, "slow_delay", lambda *_: (0.014, 1e-4))
+    monkeypatch.setattr(module, "_late_in_all_joints", lambda *_: False)
     (found,) = diagnose(bare, chain, reference=reference).findings
     assert found.cause == "motor_torque_delay"
     assert found.parameters["delay"].value == pytest.approx(0.008, abs=3e-4)
