@@ -255,7 +255,7 @@ class FrictionAsymmetry(Effect):
         if shape.form is _Asymmetric.VISCOUS:
             return (viscous,)
         # Constant at reversals, too: as much as has built up there is a bump, which other causes make as well.
-        return viscous, Column(motor=np.ones_like(motion.time))
+        return viscous, Column(motor=np.ones(len(motion.q)))
 
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """A torque at the motor."""

@@ -173,7 +173,8 @@ def _torque(graph: Graph, entry: Entry, motion: ArmMotion) -> Torques:
             for side, part in (("motor", column.motor), ("joint", column.joint)):
                 if part is None:
                     continue
-                found = cast(Traced, size * cast(Any, part))
+                # A constant column is an array of numbers.
+                found = cast(Traced, size * Traced(graph, getattr(part, "values", part)))
                 places = range(motion.n) if found.ndim == 2 else (joint,)
                 for k, value in zip(places, found.expressions(), strict=True):
                     sums[side][k] = sums[side][k] + value
