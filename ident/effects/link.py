@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -127,7 +127,7 @@ class JointElasticity(_Twisting):
         """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
         if motion.springs is not None and shape.form is _Encoder.MOTOR:
             size = shape.get("size", _SMALL)
-            return _changed_springs(motion, motion.springs.softer(joint, size), size, ("softer", joint, size))
+            return _changed_springs(motion, joint, motion.springs.softer(joint, size), size, "softer")
         at_motor = shape.form is _Encoder.MOTOR
         return _deflected(motion, joint, lambda torque: torque, at_motor, 1e-5)
 
@@ -186,9 +186,7 @@ class Backlash(_Twisting):
         """Change of all torques with the displaced link, or of the motor torque with the displaced motor."""
         size = shape.get("size", 0.0)
         if motion.springs is not None and size > 0.0 and shape.form is _Encoder.MOTOR:
-            return _changed_springs(
-                motion, motion.springs.with_play(joint, size), size, ("play", joint, size)
-            )
+            return _changed_springs(motion, joint, motion.springs.with_play(joint, size), size, "play")
 
         def half(torque: Floats) -> Floats:
             return np.asarray(0.5 * np.tanh(torque / shape["width"]))
@@ -236,9 +234,9 @@ def _deflected(
 
 
 def _changed_springs(
-    motion: ArmMotion, changed: Springs, size: float, key: tuple[Hashable, ...]
+    motion: ArmMotion, joint: int, changed: Springs, size: float, kind: str
 ) -> tuple[Column, ...]:
-    """Column of a change of the springs behind the published motors, over its `size`; remembered by `key`.
+    """Column of a change of a joint's spring behind the published motors, over its `size`; remembered by its `kind`.
 
     The links ring on their springs, which is not proportional to the size. The column belongs to one size, and its
     coefficient equals that size for the right one.
@@ -246,9 +244,13 @@ def _changed_springs(
 
     def torque(whole: ArmMotion) -> Floats:
         assert whole.springs is not None
-        return (changed.torque - whole.springs.torque) / size
+        # The springs' equation has gravity and inertia where the links were before the change.
+        further = (changed.links[0] - whole.springs.links[0])[:, joint]
+        still = np.zeros_like(further)
+        elsewhere = whole.displaced(joint, further, still, still)
+        return (changed.torque - whole.springs.torque + elsewhere) / size
 
-    return (both_sides(motion.along(torque, *key)),)
+    return (both_sides(motion.along(torque, kind, joint, size)),)
 
 
 class _Spring(Form):

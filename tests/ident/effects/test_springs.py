@@ -1,9 +1,15 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
+from ident.dynamics.kinematics import Chain
+from ident.dynamics.parameters import from_com
+from ident.dynamics.regressor import torque
 from ident.effects import EFFECTS, ELASTICITY, ArmMotion
 from ident.effects.springs import Springs
 
@@ -76,17 +82,11 @@ def test_softer_spring_bends_more() -> None:
     assert np.mean(bend) == pytest.approx(1e-4, rel=0.1)
 
 
-def test_columns_of_lost_motion_and_twist_come_from_the_springs() -> None:
-    from dataclasses import replace
-
-    time, plain = springs()
-    from ident.dynamics.kinematics import Chain
-
-    chain = Chain.from_table([{"name": "one"}])
-    zero = np.zeros_like(plain.angle)
-    motion = ArmMotion(
+def on_springs(time: np.ndarray, plain: Springs, chain: Chain, bodies: np.ndarray) -> ArmMotion:
+    """The motion of an arm of one joint on its spring."""
+    return ArmMotion(
         chain=chain,
-        bodies=np.zeros((1, 10)),
+        bodies=bodies,
         session=0,
         time=time,
         duration_s=2.0,
@@ -94,7 +94,7 @@ def test_columns_of_lost_motion_and_twist_come_from_the_springs() -> None:
         qd=plain.links[1],
         qdd=plain.links[2],
         motor_speed=plain.speed,
-        motor_acceleration=zero,
+        motor_acceleration=np.zeros_like(plain.angle),
         joint_torque=plain.torque,
         motor_torque=plain.torque,
         gear_ratio=np.ones(1),
@@ -103,6 +103,40 @@ def test_columns_of_lost_motion_and_twist_come_from_the_springs() -> None:
         motor_coulomb=np.zeros(1),
         springs=plain,
     )
+
+
+def test_a_softer_spring_lets_the_link_sag_to_another_gravity_torque() -> None:
+    chain = Chain.from_table([{"name": "one", "alpha": 0.5 * np.pi}])
+    body = from_com(10.0, np.array([0.7, 0.0, 0.0]), 0.1 * np.eye(3))[None]
+    time, angle, size = np.arange(0.0, 0.5, 2e-3), 0.6, 1e-4
+
+    def gravity(q: float) -> float:
+        return float(torque(chain, np.array([[q]]), np.zeros((1, 1)), np.zeros((1, 1)), body)[0, 0])
+
+    def rest(compliance: float) -> float:
+        return float(brentq(lambda q: angle - q - compliance * gravity(q), angle - 0.5, angle + 0.5))
+
+    before, after = (gravity(rest(1.0 / STIFFNESS + more)) for more in (0.0, size))
+    assert abs(after - before) > 0.1
+    one = np.ones((len(time), 1))
+    plain = Springs(
+        one[:, :, None] * 5.0,
+        one * before,
+        one * angle,
+        0.0 * one,
+        np.array([STIFFNESS]),
+        np.array([500.0]),
+        2e-3,
+    )
+    motion = on_springs(time, plain, chain, body)
+    (soft,) = ELASTICITY.columns(motion, 0, ELASTICITY.at_encoder("motor").at(size=size))
+    assert soft.joint is not None
+    np.testing.assert_allclose(size * soft.joint, after - before, rtol=0.02)
+
+
+def test_columns_of_lost_motion_and_twist_come_from_the_springs() -> None:
+    time, plain = springs()
+    motion = on_springs(time, plain, Chain.from_table([{"name": "one"}]), np.zeros((1, 10)))
     shape = EFFECTS["backlash"].shape_of({"width": 0.1, "size": GAP}, "encoder at the motor")
     (column,) = EFFECTS["backlash"].columns(motion, 0, shape)
     assert column.joint is not None
