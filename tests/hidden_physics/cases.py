@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -116,10 +117,11 @@ class Store:
             path = self.folder / case.name / f"session_{number + 1}.mcap"
             if not path.is_file():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                part = path.with_suffix(".part.mcap")
+                # Processes that need the same day at once record it each.
+                part = path.with_suffix(f".{os.getpid()}.part.mcap")
                 part.unlink(missing_ok=True)
                 record(order(case, number, setting, part))
-                part.rename(path)
+                part.replace(path)
             paths.append(path)
         return Sessions(tuple(paths[:-1]), tuple(paths[-1:]))
 
