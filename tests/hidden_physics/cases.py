@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
