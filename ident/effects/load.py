@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -98,9 +99,9 @@ class _Payload(Effect):
             found.append(f"first moments (x, y, z of the last link's frame, z along its joint's axis) {axes}")
         return [", ".join(found)]
 
+    @abstractmethod
     def mass_text(self, mass: Triple) -> str:
         """The mass in words."""
-        raise NotImplementedError
 
 
 class PayloadError(_Payload):

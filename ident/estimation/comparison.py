@@ -53,8 +53,8 @@ _UPRIGHT = 1e-3
 # Errors this close to one another count as equal, and so much of a joint's torque as nothing.
 _ALIKE = 0.01
 # Error of bodies like the URDF's over that of any parameters in a joint, and least share of those joints' excess in
-# the squared error of all, for a contradiction. Bodies of six real arms and light wrists of theirs stay below one or
-# the other.
+# the squared error of all, for a contradiction. The arms of `benchmarks.real_data`, with light wrists among them, stay
+# below one or the other.
 _FAR_WORSE, _MOSTLY = 3.0, 0.5
 # Squared error over the squared torque of a candidate that predicts no better than a torque of zero.
 _NOTHING = 1.0

@@ -20,7 +20,7 @@ import numpy as np
 
 from fri.errors import DataError
 from ident.dynamics import regressor
-from ident.dynamics.parameters import PER_LINK, Floats
+from ident.dynamics.parameters import PER_LINK, Floats, joint_unit
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular, rows_of
 from ident.estimation.scores import resampled
@@ -103,8 +103,8 @@ class ForwardSimulation(Tabular):
         rows = [
             (
                 joint,
-                f"{torque:.3f} {'N' if slides else 'Nm'}",
-                f"{1e3 * position:.3f} {'mm' if slides else 'mrad'}",
+                f"{torque:.3f} {joint_unit('Nm', prismatic=slides)}",
+                f"{1e3 * position:.3f} {joint_unit('mrad', prismatic=slides)}",
             )
             for joint, torque, position, slides in zip(
                 self.joint_names, self.torque_rms, self.position_rms, self.prismatic, strict=True

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.dynamics.parameters import Floats
+from ident.dynamics.parameters import Floats, joint_unit
 from ident.effects import PRESLIDING, entry_of
 from ident.effects.motion import STILL_RAD_S, turned_friction
 from ident.estimation.scores import inside
@@ -71,7 +71,7 @@ class Turning:
 
     def __str__(self) -> str:
         listed = ", ".join(
-            f"{name} {1e3 * one:.2g} {'mm' if name in self.sliding else 'mrad'}"
+            f"{name} {1e3 * one:.2g} {joint_unit('mrad', prismatic=name in self.sliding)}"
             for name, one in self.lengths.items()
         )
         return (

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.parameters import Floats
+from ident.dynamics.parameters import Floats, joint_unit
 from ident.rows.content import content
 from ident.rows.data_quality import Jump, position_jumps, run_bounds
 from ident.rows.shared_rows import ROUNDED, SAME_ROWS, Cells, row_numbers, shared
@@ -253,7 +253,7 @@ def jump_doubts(
         looks = "samples missing without a gap in the stamps"
         if len({jump.joint for jump in others}) == 1:
             looks += ", or a joint zeroed anew"
-        unit = "m" if prismatic[largest.joint] else "rad"
+        unit = joint_unit("rad", prismatic=bool(prismatic[largest.joint]))
         mend = "give the samples the times of their source, or cut the log there"
         doubts.append(doubt(others, f"{size} {unit}", looks, mend))
     return doubts
