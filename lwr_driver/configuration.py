@@ -104,6 +104,8 @@ def _shown(name: str | Path, longest: int = _LONGEST_SHOWN) -> str:
 
 def read_text(path: Path) -> str:
     """Text of a configuration file; ConfigurationError if it cannot be read or is far too large."""
+    if path.is_dir():
+        raise ConfigurationError(f"{path}: is a folder; give a file in it")
     try:
         size = path.stat().st_size
         if size > _LARGEST_FILE:

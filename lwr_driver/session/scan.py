@@ -23,6 +23,7 @@ from lwr_driver.configuration import as_path
 from lwr_driver.session.container import FOOTER_SIZE, MAGIC, MESSAGE_HEAD, Opcode
 
 _LARGEST_CHUNK = 1 << 28
+_LOGS_NAMED = 5
 _LOOSE_BYTES = 4 << 20
 _HEAD = np.dtype(
     [
@@ -123,6 +124,10 @@ class Scan:
 
     def blocks(self) -> Iterator[Block]:
         """The messages, chunk by chunk. DataError if the file is no MCAP or a chunk within it is damaged."""
+        if self.path.is_dir():
+            logs = ", ".join(log.name for log in sorted(self.path.glob("*.mcap"))[:_LOGS_NAMED])
+            advice = f"its session logs by name: {logs}" if logs else "a session log (.mcap); it holds none"
+            raise DataError(f"{self.path}: is a folder; give {advice}")
         try:
             size = self.path.stat().st_size
             file = open(self.path, "rb")  # noqa: SIM115 - closed below, also when the caller stops early

@@ -69,6 +69,11 @@ def test_files_are_found_beside_and_in_configs(tmp_path: Path, monkeypatch: pyte
         find("absent.yaml")
 
 
+def test_a_folder_in_place_of_a_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=f"{tmp_path.name}: is a folder; give a file in it$"):
+        read_yaml(tmp_path)
+
+
 def test_syntax_errors_name_file_and_line(tmp_path: Path) -> None:
     broken = tmp_path / "broken.yaml"
     broken.write_text("a: [1, 2\nb: 3\n")

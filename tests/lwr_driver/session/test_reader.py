@@ -429,6 +429,15 @@ def test_file_that_is_not_there(tmp_path):
         read_session(tmp_path / "gone.mcap")
 
 
+def test_a_folder_names_the_logs_in_it(tmp_path):
+    with pytest.raises(DataError, match=r"is a folder; give a session log \(\.mcap\); it holds none$"):
+        read_session(tmp_path)
+    for name in ("b.mcap", "a.mcap", "notes.txt"):
+        (tmp_path / name).touch()
+    with pytest.raises(DataError, match=r"is a folder; give its session logs by name: a\.mcap, b\.mcap$"):
+        read_session(tmp_path)
+
+
 def test_session_without_joint_states_names_its_topics(tmp_path):
     path = tmp_path / "a.mcap"
     messages, _, _ = plain_messages(3)
