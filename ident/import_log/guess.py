@@ -10,40 +10,37 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.urdf import Urdf, read_urdf
+from ident.import_log.clock import Clocks, in_rows
 from ident.import_log.conversion import MOST_MISSING
 from ident.import_log.fields import Field, fields
-from ident.import_log.mapping import LogMapping, Signal, TimeBase, Transmission, Unit
-from ident.import_log.rates import ALIKE, Rates, compare
+from ident.import_log.mapping import LogMapping, Signal, Transmission, Unit
+from ident.import_log.rates import Rates, compare
 from ident.import_log.recording import Recording
 from ident.import_log.rests import rests, without_gripper
-from ident.import_log.tables import Floats
 from ident.import_log.turns import unwrapped
+from ident.import_log.units import (
+    ANGLES,
+    RATES,
+    beyond_limits,
+    close,
+    excess,
+    in_degrees,
+    rate_unit,
+    same_in_all,
+    unlike,
+)
+from ident.import_log.unnamed import unnamed_columns
 from lwr_driver.configuration import yaml_text
 from lwr_driver.listing import Listing, Piece, text_of
 
-_ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
-_RATES = {"rad/s": 1.0, "deg/s": 180.0 / math.pi, "rpm": 30.0 / math.pi}
-# Share of rows whose times go back, beyond which the order of the rows is in doubt.
-_STEPS_BACK = 0.001
-_SHORTEST_S, _LONGEST_S = 1e-4, 0.1
-_RATIO = 1.5
-"""Largest factor between dq/dt and a velocity in the right unit; the units are factors of 5 apart."""
-_OFF, _SPREAD = 0.03, 0.25
-"""Least deviation of that factor that is said if all joints agree, and their largest spread over it."""
 _LARGEST_CURRENT_A = 200.0
-_UNIX_S = 1e9
-_SLACK = 0.05
-"""Share of a joint's range by which positions may exceed it."""
-_TURNS = 4.0 * math.pi
-_WAY = 0.5
-"""Least way of a joint in rad that speaks for rad: in deg it would be at rest."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +111,10 @@ class _Guesser:
         self.robot: Urdf = read_urdf(urdf)
         movable = [joint.name for joint in self.robot.joints if joint.movable]
         self.fields, self.numbers = _whole_rows(fields(Recording(source), movable))
-        self.why: dict[str, str] = {}
+        self.why: dict[str, str] = {}  # by the names of fields
         if len(self.fields) == 1 and not any(self.fields[0].labels) and self.fields[0].array is None:
-            self.fields = self._blocks(self.fields[0])
+            self.fields, self.why = unnamed_columns(self.fields[0], self.robot, known.joints, source)
+        self.clocks = Clocks(source, self.fields, self.numbers, known.rate_hz)
         self.rows: list[tuple[str, str, str, str]] = []
         self.used: set[str] = set()
         self.reasons: dict[str, str] = {}
@@ -137,12 +135,12 @@ class _Guesser:
         bad = np.flatnonzero(~np.isfinite(position.values).all(axis=1))
         if len(bad):
             raise DataError(
-                f"{self.source}: {position.shown} has missing values in {_rows(len(bad))} of {len(position.values)}, "
+                f"{self.source}: {position.shown} has missing values in {in_rows(len(bad))} of {len(position.values)}, "
                 f"first in row {bad[0]}; at most {100.0 * MOST_MISSING:g} % may be: take other columns, or import "
                 "a part with `lwr-run import --rows`, each with a mapping file"
             )
         unit, reason = self._angle_unit(position, joints, self._best("velocity", joints))
-        size = _ANGLES[unit]
+        size = ANGLES[unit]
         gripper = False
         if not self.known.joints and self.known.tip is None:
             arm = without_gripper(joints, position.values * size, self.robot, self.known.base)
@@ -159,16 +157,19 @@ class _Guesser:
         )
         angle, _ = unwrapped(position.values * size)
         velocity = self._finite(self._best("velocity", joints))
-        time, times = self._time(angle, velocity, unit)
-        rates = None if velocity is None else compare(angle, velocity.values, times)
+        clock = self.clocks.of(angle, velocity, unit)
+        self.rows.append(("time", clock.field.shown if clock.field else "", clock.unit, clock.why))
+        if clock.field:
+            self.used.add(clock.field.name)
+        rates = None if velocity is None else compare(angle, velocity.values, clock.times)
         if velocity is not None and rates is not None:
             self._one_unit(position, velocity, joints, rates, unit)
         signals: dict[str, Any] = {"position": self._take("position", position, unit, reason)}
         if velocity is not None and rates is not None and velocity.name not in self.reasons:
-            if (found := _rate_unit(rates)) is not None:
+            if (found := rate_unit(rates)) is not None:
                 name, factor = found
                 why_rate = f"{factor:.2f} times dq/dt in this unit"
-                if _same_in_all(rates, factor):
+                if same_in_all(rates, factor):
                     why_rate += ", in all joints: a clock or a scale is off"
                 signals["velocity"] = self._take("velocity", velocity, name, why_rate)
             else:
@@ -181,7 +182,7 @@ class _Guesser:
         mapping = LogMapping(
             robot=self.robot.name,
             joints=joints,
-            time=time,
+            time=clock.base,
             urdf=str(Path(self.urdf).resolve()),
             held=held or None,
             base=self.known.base,
@@ -216,7 +217,7 @@ class _Guesser:
         if not len(bad):
             return velocity
         row = self.numbers[len(velocity.values)][bad[0]]
-        self.reasons[velocity.name] = f"missing values in {_rows(len(bad))}, first in row {row}"
+        self.reasons[velocity.name] = f"missing values in {in_rows(len(bad))}, first in row {row}"
         return None
 
     def _name_columns(self, count: int) -> None:
@@ -232,7 +233,7 @@ class _Guesser:
         found = rests(
             self.source,
             position.labels,
-            position.values * [1.0 if name in prismatic else _ANGLES[unit] for name in position.labels],
+            position.values * [1.0 if name in prismatic else ANGLES[unit] for name in position.labels],
             joints,
             self.robot,
             self.known.base,
@@ -325,17 +326,17 @@ class _Guesser:
         limits = np.array([by_name[name].limits or (-math.inf, math.inf) for name in joints])
         turning = np.array([by_name[name].kind == "revolute" for name in joints])
         known = "the limits of the URDF" if np.isfinite(limits).any() else "two turns"
-        beyond = {unit: _beyond(position.values * size, limits) for unit, size in _ANGLES.items()}
+        beyond = {unit: beyond_limits(position.values * size, limits) for unit, size in ANGLES.items()}
         unit, reason = "rad", f"{'most joints ' if beyond['rad'].any() else ''}within {known}"
         if velocity is not None and (ratio := self._ratio(position, velocity)) is not None:
             unit = "deg" if ratio < 1.0 else "rad"
             reason = f"{velocity.shown} are {ratio:.3g} times dq/dt"
-        elif _in_degrees(position.values[:, turning], limits[turning], beyond["rad"][turning]):
+        elif in_degrees(position.values[:, turning], limits[turning], beyond["rad"][turning]):
             unit, reason = "deg", f"beyond {known} in rad, within them in deg"
         out = beyond[unit]
         # Lengths in m beside angles in deg have no unit in common; a mapping's `scale` can tell them apart.
         if 2 * np.sum(out) >= len(out) or (unit == "deg" and not turning.all()):
-            joint = int(np.argmax(_excess(position.values, limits)))
+            joint = int(np.argmax(excess(position.values, limits)))
             low, high = position.values[:, joint].min(), position.values[:, joint].max()
             raise DataError(
                 f"{self.source}: {position.shown} runs from {low:.4g} to {high:.4g} at {joints[joint]}, outside the "
@@ -344,7 +345,7 @@ class _Guesser:
                 "`offset_rad`, `joints`)"
             )
         if out.any():
-            values = position.values * _ANGLES[unit]
+            values = position.values * ANGLES[unit]
             listed = ", ".join(
                 f"{joints[k]} ({values[:, k].min():.3g} to {values[:, k].max():.3g} rad, limits "
                 f"{limits[k, 0]:.3g} to {limits[k, 1]:.3g})"
@@ -357,7 +358,7 @@ class _Guesser:
         """Velocity over dq/dt in the recorded numbers, where it tells the unit of the positions; else None."""
         if len(velocity.values) != len(position.values) or not np.isfinite(velocity.values).all():
             return None
-        times = self._seconds(len(position.values))
+        times = self.clocks.seconds(len(position.values))
         if times is None:
             return None
         rates = compare(position.values, velocity.values, times)
@@ -366,9 +367,9 @@ class _Guesser:
         if 2 * np.isfinite(ratios).sum() <= len(ratios):
             return None
         ratio = float(np.nanmedian(ratios))
-        degree = _RATES["deg/s"]
-        told = (1.0 / degree, degree, _RATES["rpm"])
-        return ratio if any(abs(math.log(ratio / one)) < math.log(_RATIO) for one in told) else None
+        degree = RATES["deg/s"]
+        told = (1.0 / degree, degree, RATES["rpm"])
+        return ratio if any(close(ratio, one) for one in told) else None
 
     def _one_unit(
         self, position: Field, velocity: Field, joints: Sequence[str], rates: Rates, unit: str
@@ -382,7 +383,7 @@ class _Guesser:
         if len(known) < 3:
             return
         common = float(np.median(factors[known]))
-        off = np.abs(np.log(factors / common)) > math.log(_RATIO)
+        off = unlike(factors, common)
         # Of a joint without a clear velocity nothing is known.
         odd, fine = [k for k in known.tolist() if off[k]], [k for k in range(len(joints)) if not off[k]]
         if not odd or 2 * len(odd) >= len(known):
@@ -390,11 +391,11 @@ class _Guesser:
         rest = position.of([joints[k] for k in fine]) if set(joints) <= set(position.labels) else None
         rest = rest or replace(position, values=position.values[:, fine])
         of_rest, _ = self._angle_unit(rest, [joints[k] for k in fine])
-        degree = _ANGLES["deg"]
+        degree = ANGLES["deg"]
         names = ", ".join(joints[k] for k in odd)
         # What the numbers of the odd joints are to be multiplied with, to be like the others.
         for other, size in (("deg", degree), ("rad", 1.0 / degree)):
-            like = all(abs(math.log(factors[k] / common / size)) < math.log(_RATIO) for k in odd)
+            like = all(close(factors[k] / common, size) for k in odd)
             if like and other != of_rest:
                 scale = ", ".join(f"{size if k in odd else 1.0:.6g}" for k in range(len(joints)))
                 raise DataError(
@@ -406,107 +407,6 @@ class _Guesser:
         self.reasons[velocity.name] = (
             f"{times} times as large over dq/dt at {names} as at the others; `scale` in `velocity` mends it"
         )
-
-    def _time(self, angle: Floats, velocity: Field | None, unit: str) -> tuple[TimeBase, Floats]:
-        """The time base, and the times of the samples (n,) [s] after the first."""
-        count = len(angle)
-        if self.known.rate_hz is not None:
-            self.rows.append(("time", "", "", f"{self.known.rate_hz:g} Hz, as given"))
-            return TimeBase(rate_hz=self.known.rate_hz), np.arange(count) / self.known.rate_hz
-        if (clock := self._clock_of(count)) is not None:
-            return self._clock(clock)
-        if velocity is not None:
-            steps = compare(angle, velocity.values, np.arange(count, dtype=np.float64))
-            # Velocities have the unit of the positions.
-            period = (_RATES["deg/s"] if unit == "deg" else 1.0) / max(steps.ratio, 1e-9)
-            if steps.alike > ALIKE and _SHORTEST_S <= period <= _LONGEST_S:
-                rate = float(f"{1.0 / period:.3g}")
-                why = f"{rate:g} Hz, from the positions against {velocity.shown}{self._going_back(count)}"
-                self.rows.append(("time", "", "", why))
-                return TimeBase(rate_hz=rate), np.arange(count) / rate
-        for one, rows in self._falls(count):
-            raise DataError(f"{self.source}: {self._fall(one, rows)}")
-        raise DataError(
-            f"{self.source}: no rising column of times; give the rate of the samples with --rate-hz"
-        )
-
-    def _falls(self, count: int) -> list[tuple[Field, NDArray[np.int64]]]:
-        """The columns of times of `count` samples that go back, and the rows that begin so; the fewest first."""
-        clocks = [one for one in self.fields if one.quantity == "time" and len(one.values) == count]
-        falls = [(one, np.flatnonzero(np.diff(one.values[:, 0]) < 0.0) + 1) for one in clocks]
-        return sorted((pair for pair in falls if len(pair[1])), key=lambda pair: len(pair[1]))
-
-    def _going_back(self, count: int) -> str:
-        """Why a column of times is not used, for the table. DataError where the order of the samples is in doubt."""
-        for one, rows in self._falls(count):
-            if len(rows) > max(1.0, _STEPS_BACK * count):
-                raise DataError(f"{self.source}: {self._fall(one, rows)}")
-            row = self.numbers[count][rows[0]]
-            return f"; {one.shown} goes back in row {row} (counted from 0) and is not used"
-        return ""
-
-    def _fall(self, clock: Field, rows: NDArray[np.int64]) -> str:
-        """Where a column of times goes back, in `rows`, and what to do."""
-        times, row = clock.values[:, 0], int(rows[0])
-        numbers = self.numbers[len(times)]
-        said = (
-            f"the times of {clock.shown} go back in {len(rows)} of {_rows(len(times))}, first in row {numbers[row]} "
-            f"(counted from 0), {times[row]:.12g} after {times[row - 1]:.12g}"
-        )
-        before = np.flatnonzero(times[:row] == times[row])
-        if len(before):
-            advice = f"the time of row {numbers[before[0]]} again: remove the rows that repeat others"
-        else:
-            advice = "sort the rows by their times, or correct a wrong time"
-        return f"{said}; {advice}, or give the rate of the samples with --rate-hz if the rows are in order"
-
-    def _clock_of(self, count: int) -> Field | None:
-        """The column of times of `count` samples; of a date split in two, the finer part."""
-        clocks = [one for one in self.fields if one.quantity == "time" and len(one.values) == count]
-        clocks = [one for one in clocks if (np.diff(one.values[:, 0]) >= 0).all() and np.ptp(one.values) > 0]
-        return min(clocks, key=lambda one: int(np.sum(np.diff(one.values[:, 0]) == 0)), default=None)
-
-    def _seconds(self, count: int) -> Floats | None:
-        """Times (n,) [s] of the samples after the first, None without a clock or a rate."""
-        if self.known.rate_hz is not None:
-            return np.arange(count) / self.known.rate_hz
-        clock = self._clock_of(count)
-        unit = None if clock is None else _unit_of_time(clock.values[:, 0])
-        if clock is None or unit is None:
-            return None
-        times = clock.values[:, 0]
-        seconds = (times - times[0]) * TimeBase(1, unit=unit).seconds
-        # Coarse stamps show the way on average only.
-        return np.linspace(0.0, seconds[-1], count) if (np.diff(times) == 0).any() else seconds
-
-    def _clock(self, clock: Field) -> tuple[TimeBase, Floats]:
-        times = clock.values[:, 0]
-        step = _step(times)
-        unit = _unit_of_time(times)
-        if unit is None:
-            raise DataError(
-                f"{self.source}: the times {clock.shown} are {step:.4g} apart, in no unit a rate from 10 Hz to 10 kHz; "
-                "give the rate with --rate-hz"
-            )
-        base = TimeBase(1, unit=unit)
-        column: str | int = clock.array or (clock.columns[0] if clock.columns else 1)
-        again = np.flatnonzero(np.diff(times) == 0) + 1
-        found = TimeBase(
-            column=column,
-            file=clock.file if isinstance(clock.file, str) else None,
-            unit=unit,
-            zero="unix" if times[0] * base.seconds > _UNIX_S else "start",
-            equal="spread" if len(again) else "refuse",
-        )
-        why = f"steps of {step:.4g} on average"
-        if len(again):
-            first = self.numbers[len(times)][again[0]]
-            why += f", equal times spread: {_rows(len(again))}, first row {first} (counted from 0)"
-        self.used.add(clock.name)
-        self.rows.append(("time", clock.shown, unit, why))
-        seconds = self._seconds(len(times))
-        assert seconds is not None
-        return found, seconds
 
     def _torques(self, joints: Sequence[str]) -> dict[str, Signal]:
         """Signals of the torques and currents."""
@@ -538,57 +438,6 @@ class _Guesser:
             raise self._unknown("torque")
         return found
 
-    def _blocks(self, table: Field) -> list[Field]:
-        """A table without names, split by the joints of the longest arm: times, positions, and their derivatives."""
-        names = self.known.joints or self.robot.arm(
-            names=[joint.name for joint in self.robot.joints if joint.driven]
-        )
-        width, count = table.values.shape[1], len(names)
-        grips = {joint.name for joint in self.robot.joints if joint.grips}
-        while not self.known.joints and count > 1 and names[count - 1] in grips and width % count > 1:
-            count -= 1
-        start = width % count
-        if start > 1 or width < 2 * count:
-            raise DataError(
-                f"{self.source}: {width} columns without names are no positions and torques of {count} joints; name "
-                "the joints with --joints, or write a mapping file for `lwr-run import`, or name columns in a first row"
-            )
-        parts = [
-            replace(
-                table,
-                values=table.values[:, at : at + count],
-                columns=tuple(range(at + 1, at + count + 1)),
-                labels=tuple(str(k + 1) for k in range(count)),
-            )
-            for at in range(start, width, count)
-        ]
-        parts = [part for part in parts if np.ptp(part.values, axis=0).max() > 0.0]
-        found = [replace(parts.pop(0), name="position")]
-        for quantity in ("velocity", "acceleration"):
-            if not parts:
-                break
-            count_up = np.arange(len(table.values), dtype=np.float64)
-            scores = [compare(found[-1].values, part.values, count_up).alike for part in parts]
-            if max(scores) > ALIKE:
-                found.append(replace(parts.pop(int(np.argmax(scores))), name=quantity))
-                self.why[quantity] = f"correlates {max(scores):.3f} with the change of {found[-2].shown}"
-            else:
-                break
-        if len(parts) != 1:
-            listed = "; ".join(part.shown for part in parts) or "none"
-            raise DataError(
-                f"{self.source}: of the columns without names these may be torques: {listed}. Write a mapping file for "
-                "`lwr-run import`, or name the columns in a first row"
-            )
-        self.why["position"] = "the first columns"
-        self.why["torque"] = "the columns left"
-        times = (
-            [replace(table, name="time", values=table.values[:, :1], columns=(1,), labels=("",))]
-            if start
-            else []
-        )
-        return [*times, *found, replace(parts[0], name="torque")]
-
 
 def _whole_rows(found: list[Field]) -> tuple[list[Field], dict[int, NDArray[np.int64]]]:
     """The fields without the rows that miss a position or a time, and by the number of rows left their numbers.
@@ -611,67 +460,8 @@ def _whole_rows(found: list[Field]) -> tuple[list[Field], dict[int, NDArray[np.i
     return left, {len(numbers): numbers for numbers in kept.values()}
 
 
-def _step(times: Floats) -> float:
-    """Mean step of the times (n,), in their unit."""
-    return float(times[-1] - times[0]) / (len(times) - 1)
-
-
-def _unit_of_time(times: Floats) -> Literal["s", "ms", "us", "ns"] | None:
-    """The unit in which the times (n,) are of a rate from 10 Hz to 10 kHz."""
-    units: tuple[Literal["s", "ms", "us", "ns"], ...] = ("s", "ms", "us", "ns")
-    step = _step(times)
-    return next((u for u in units if _SHORTEST_S <= step * TimeBase(1, unit=u).seconds < _LONGEST_S), None)
-
-
-def _excess(angle: Floats, limits: Floats) -> Floats:
-    """How far angles (n, k) leave limits (k, 2) with their slack, at most (k,)."""
-    slack = _SLACK * np.nan_to_num(limits[:, 1] - limits[:, 0], posinf=0.0)
-    past = angle - np.clip(angle, limits[:, 0] - slack, limits[:, 1] + slack)
-    return cast(Floats, np.abs(past).max(axis=0))
-
-
-def _beyond(angle: Floats, limits: Floats) -> NDArray[np.bool_]:
-    """Joints (k,) whose angles (n, k) [rad] leave their limits (k, 2), or go beyond two turns."""
-    return (_excess(angle, limits) > 0.0) | (np.abs(angle).max(axis=0) >= _TURNS)
-
-
-def _in_degrees(numbers: Floats, limits: Floats, beyond: NDArray[np.bool_]) -> bool:
-    """Whether the numbers (n, k) of turning joints, of which some are `beyond` their limits (k, 2) in rad, are degrees.
-
-    With a wrong sign or order a joint keeps the largest limits of the arm. More joints have to be beyond theirs than
-    move within them as joints do in rad, or two of them beyond two turns.
-    """
-    if not beyond.any():
-        return False
-    largest = float(np.abs(limits).max())
-    largest = largest * (1.0 + _SLACK) if math.isfinite(largest) else _TURNS
-    within = ~beyond & (np.ptp(numbers, axis=0) > _WAY)
-    size = np.abs(numbers).max(axis=0)
-    return bool(size.max() > largest and (beyond.sum() > within.sum() or np.sum(size >= _TURNS) > 1))
-
-
-def _rows(count: int) -> str:
-    return "1 row" if count == 1 else f"{count} rows"
-
-
 def _span(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
-
-
-def _rate_unit(rates: Rates) -> tuple[str, float] | None:
-    """Unit of a velocity by dq/dt, and its ratio to that in the unit; None if it is no velocity of these joints."""
-    if rates.alike < ALIKE:
-        return None
-    unit, size = min(_RATES.items(), key=lambda item: abs(math.log(rates.ratio / item[1])))
-    return (unit, rates.ratio / size) if abs(math.log(rates.ratio / size)) < math.log(_RATIO) else None
-
-
-def _same_in_all(rates: Rates, factor: float) -> bool:
-    """Whether the joints agree about a factor off 1."""
-    found = rates.by_channel / rates.ratio
-    found = found[np.isfinite(found)]
-    off = abs(factor - 1.0)
-    return len(found) > 1 and off > _OFF and bool(np.max(np.abs(found - 1.0)) < _SPREAD * off)
 
 
 def _torque_unit(field: Field) -> str:
