@@ -16,7 +16,7 @@ import numpy as np
 from fri.errors import ConfigurationError
 from ident.dynamics.parameters import joint_unit
 from ident.dynamics.structure import Side
-from ident.effects import channel, drive, link, load, nameless
+from ident.effects import channel, drive, friction, link, load, nameless
 from ident.effects.effect import (
     Column,
     Discriminator,
@@ -70,8 +70,8 @@ __all__ = [
 
 _ENTRY = frozenset({"cause", "side", "joints", "form", "parameters"})
 
-FRICTION_TEMPERATURE = drive.FrictionTemperature()
-PRESLIDING = drive.PreslidingHysteresis()
+FRICTION_TEMPERATURE = friction.FrictionTemperature()
+PRESLIDING = friction.PreslidingHysteresis()
 ELASTICITY = link.JointElasticity()
 BASE_TILT = link.BaseTilt()
 PAYLOAD_ERROR = load.PayloadError()
@@ -85,12 +85,12 @@ DELAYS = {"motor": channel.MotorTorqueDelay(), "joint": channel.JointTorqueDelay
 EFFECTS: dict[str, Effect] = {
     effect.cause: effect
     for effect in (
-        drive.Stribeck(),
-        drive.ViscousNonlinear(),
-        drive.FrictionAsymmetry(),
-        drive.FrictionLoad(),
+        friction.Stribeck(),
+        friction.ViscousNonlinear(),
+        friction.FrictionAsymmetry(),
+        friction.FrictionLoad(),
         FRICTION_TEMPERATURE,
-        drive.FrictionPosition(),
+        friction.FrictionPosition(),
         PRESLIDING,
         drive.GearRipple(),
         drive.MotorTorqueGain(),

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from ident.effects.course import TIME_CONSTANT, Course, Drifting
-from ident.effects.drive import ScaleError, dahl_step
+from ident.effects.drive import ScaleError
 from ident.effects.effect import (
     Column,
     Discriminator,
@@ -24,6 +24,7 @@ from ident.effects.effect import (
     Simulated,
     Variable,
 )
+from ident.effects.friction import dahl_step
 from ident.effects.motion import ArmMotion, Floats, dahl
 from ident.effects.words import Values, one_joint, quantity, times, wave
 
