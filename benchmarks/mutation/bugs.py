@@ -95,7 +95,7 @@ BUGS: tuple[Bug, ...] = (
     ),
     _causes(
         "the simulated Stribeck effect lowers the friction",
-        "drive.py",
+        "friction.py",
         'loads.Fcm[run.joint] += values["amplitude"] * fall',
         'loads.Fcm[run.joint] -= values["amplitude"] * fall',
     ),
