@@ -9,10 +9,11 @@ import numpy as np
 
 from fri.errors import DataError
 from ident.diagnosis.candidates import Dictionary, Trial
-from ident.diagnosis.evidence import Evidence, Floats
+from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.noise import noise_floor, repeatability
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal, structure_of
 from ident.diagnosis.nominal_arm import NominalArm
+from ident.diagnosis.products import Floats
 from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import Reference, joint_of, symbol_of
 from ident.diagnosis.selection import Selection

@@ -10,10 +10,12 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score, chance
+from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.nominal import Nominal, SideRows
+from ident.diagnosis.products import Floats, Key, Products, Rows
 from ident.diagnosis.recording import sensor_limits
 from ident.diagnosis.rivals import exceeds
+from ident.diagnosis.score import Score, chance
 from ident.diagnosis.settings import A_COEFFICIENT
 from ident.effects import DELAYS, EFFECTS, Effect, Setting, Shape
 from ident.rows.data_quality import run_bounds

@@ -17,11 +17,12 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench, again_with, prepare_bench
 from ident.diagnosis.candidates import Candidate, Trial
-from ident.diagnosis.evidence import Floats, chance
 from ident.diagnosis.nominal_arm import NominalArm
+from ident.diagnosis.products import Floats
 from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import USUAL_CHANGES
 from ident.diagnosis.rivals import likelihood
+from ident.diagnosis.score import chance
 from ident.diagnosis.selection import Claim, Selection, State
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import EFFECTS, ELASTICITY, PRESLIDING, Shape, entry_of

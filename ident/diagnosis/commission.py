@@ -25,11 +25,11 @@ from ident.diagnosis.broken_data import broken_channels, refuse, without_broken
 from ident.diagnosis.channel_delays import CHANNELS, channel_delays, common_delays, mean_of
 from ident.diagnosis.character import character
 from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std, habit, largest_left
-from ident.diagnosis.evidence import Floats, Rows
 from ident.diagnosis.held_out import held_out
 from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.presliding import SlowTurns, presliding_length, slow_turns, with_far_presliding
 from ident.diagnosis.probes import remainder_gains
+from ident.diagnosis.products import Floats, Rows
 from ident.diagnosis.recording import SessionRecord, record, settled
 from ident.diagnosis.reference import (
     Reference,

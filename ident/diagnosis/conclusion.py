@@ -11,7 +11,6 @@ from fri.errors import DataError
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, doubted
-from ident.diagnosis.evidence import Floats
 from ident.diagnosis.extension import Member, extension, power_left, title, titles
 from ident.diagnosis.findings import in_order, limit_findings, loss_finding, sizeless
 from ident.diagnosis.held_out import HeldOut, held_out, worse_rows
@@ -19,6 +18,7 @@ from ident.diagnosis.models import changes_of, fitted_models, lasting, without_h
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
 from ident.diagnosis.payloads import unchecked_masses
 from ident.diagnosis.probes import Remainder, find_remainders
+from ident.diagnosis.products import Floats
 from ident.diagnosis.refit import BY_IDENTIFY, Entries, left_by, refitted
 from ident.diagnosis.result import Diagnosis, Finding, Nameless, RowStates, Unexplained
 from ident.diagnosis.task import Baseline, State, Task

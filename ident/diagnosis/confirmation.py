@@ -10,11 +10,11 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import Grounds, probability
-from ident.diagnosis.evidence import Rows
 from ident.diagnosis.findings import finding_of, timing_finding
 from ident.diagnosis.held_out import HeldOut, fall, held_out, spread_out, worse_rows
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.probes import Remainder, find_remainders
+from ident.diagnosis.products import Rows
 from ident.diagnosis.reference import USUAL_DAYS
 from ident.diagnosis.result import Finding
 from ident.diagnosis.selection import Claim

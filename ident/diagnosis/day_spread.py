@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import special
 
-from ident.diagnosis.evidence import Floats
 from ident.diagnosis.nominal_arm import GAIN_STD
+from ident.diagnosis.products import Floats
 from ident.diagnosis.reference import (
     DELAY_STD_S,
     ELSE,

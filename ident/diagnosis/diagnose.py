@@ -29,12 +29,12 @@ from ident.diagnosis.channel_delays import ONE_IN, sides_apart
 from ident.diagnosis.conclusion import conclude
 from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import confirmed_delay
-from ident.diagnosis.evidence import Score
 from ident.diagnosis.models import lasting
 from ident.diagnosis.payloads import other_masses, payload_finding, unstated_body, with_masses
 from ident.diagnosis.recording import record, settled, usual_step
 from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
 from ident.diagnosis.result import Diagnosis, Finding
+from ident.diagnosis.score import Score
 from ident.diagnosis.selection import Claim, Selection, best_candidate, longer_turns
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.task import Baseline, Simulate, State, Task

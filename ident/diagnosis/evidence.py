@@ -9,124 +9,41 @@ motion never checks itself.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.diagnosis.nominal import Nominal
+from ident.diagnosis.products import (
+    Fit,
+    Floats,
+    Key,
+    Products,
+    Rows,
+    Sums,
+    add_products,
+    block_sums,
+    inverse_of,
+    left_beside,
+    schur,
+)
+from ident.diagnosis.score import Score, widened
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.estimators.estimate import chi_square_tail, fisher_tail
+from ident.estimators.estimate import chi_square_tail
 from ident.estimators.physical import lacking_bodies
 from lwr_driver.session.spool import Arena
 
-Floats = NDArray[np.float64]
 # Least share of a column's power left by base parameters without the prior, where the prior is a drawing.
 _OWN_SHARE = 3e-3
 
-# A column with less than this share of its power beside the base carries no information of its own.
-_LEAST_LEFT = 1e-5
 # A fall of the chi-square up to this is no evidence, whatever its value on the held-back parts.
 _NO_EVIDENCE = 12.0
 
-Key = tuple[str, int]
-Rows = Mapping[Key, Floats]
-"""Columns in rows: (m, k) for each side and joint with non-zero entries."""
-_Sums = tuple[Floats, Floats, Floats]
 _Columns = Mapping[Key, Floats] | Callable[[], Mapping[Key, Floats]]
-
-
-@dataclass(frozen=True, eq=False)
-class Score:
-    """Contribution of a group of k columns to the model.
-
-    gain, fitted : fall of the chi-square on the parts held back in turn, and on the fitted rows.
-    coefficients (k,), covariance (k, k) from blocks. p_value : of the hypothesis of all zero. inflation : the gain
-    over the number of rows of the joints and sides it acts on, the explained relative excess of power. robust : gives
-    covariance and number of active blocks, on demand. chance : a p-value from another source.
-    """
-
-    gain: float
-    fitted: float
-    coefficients: Floats
-    inflation: float
-    robust: Callable[[], tuple[Floats, int]]
-    chance: float | None = None
-
-    @cached_property
-    def uncertainty(self) -> tuple[Floats, int]:
-        """Covariance (k, k) from blocks, and their number."""
-        return self.robust()
-
-    @property
-    def covariance(self) -> Floats:
-        """(k, k), from blocks."""
-        return self.uncertainty[0]
-
-    @cached_property
-    def p_value(self) -> float:
-        """Probability of such coefficients where all are zero."""
-        if self.chance is not None:
-            return self.chance
-        return chance(self.coefficients, *self.uncertainty)
-
-
-def chance(coefficients: Floats, covariance: Floats, blocks: int) -> float:
-    """Probability of such coefficients (k,) where all are zero; their covariance (k, k) from a number of blocks."""
-    k = len(coefficients)
-    try:
-        value = float(coefficients @ np.linalg.solve(covariance, coefficients))
-    except np.linalg.LinAlgError:
-        return 1.0
-    return fisher_tail(value / k, k, max(blocks - k, 1))
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """Least-squares values (P,) of base and further columns, and the inverse Gram matrix (P, P)."""
-
-    values: Floats
-    inverse: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class Products:
-    """Products of a group's columns with the base, among themselves and with the torques in each block.
-
-    alone : (blocks, k, p) with the base parameters; own (blocks, k, k); target (blocks, k). parts : (parts, blocks),
-    1 for the blocks of a part held back in turn. further : makes those with the further columns (blocks, k, w) on
-    demand; further_sums : their sums (parts, k, w). crossed : such sums by group of further columns, as met so far.
-    """
-
-    alone: Floats
-    own: Floats
-    target: Floats
-    parts: Floats
-    further: Callable[[], Floats] | None = None
-    further_sums: Floats | None = None
-    crossed: dict[int, Floats] = field(default_factory=dict)
-
-    @cached_property
-    def base(self) -> Floats:
-        """(blocks, k, P) with base and further columns."""
-        return self.alone if self.further is None else np.concatenate([self.alone, self.further()], axis=2)
-
-    @cached_property
-    def sums(self) -> _Sums:
-        """Base, own and target of each part."""
-        base = _sums(self.parts, self.alone)
-        if self.further_sums is not None:
-            base = np.concatenate([base, self.further_sums], axis=2)
-        return base, _sums(self.parts, self.own), self.parts @ self.target
-
-    def only(self, on: Floats) -> Products:
-        """Products of the blocks with weight 1 in `on` (blocks,) alone."""
-        wide = on[:, None, None]
-        return Products(self.base * wide, self.own * wide, self.target * on[:, None], self.parts)
 
 
 class Evidence:
@@ -274,7 +191,7 @@ class Evidence:
                     self.gram[:, there, here] = cross.transpose(0, 2, 1)
         scale = np.sqrt(np.einsum("bii->i", self.gram))
         self._scale = np.where(scale > 0.0, 1.0 / np.where(scale > 0.0, scale, 1.0), 0.0)
-        self._part_gram, self._part_target = _sums(self.parts, self.gram), self.parts @ self.target
+        self._part_gram, self._part_target = block_sums(self.parts, self.gram), self.parts @ self.target
         gram, target = self._part_gram.sum(axis=0), self._part_target.sum(axis=0)
         self.full = self._fit(gram, target)
         self._free = None
@@ -305,7 +222,7 @@ class Evidence:
             p = self.base_count
             gram[:p, :p] += self.prior[0]
             target[:p] += self.prior[0] @ self.prior[1]
-        inverse = _inverse(gram, s)
+        inverse = inverse_of(gram, s)
         return Fit(inverse @ target, inverse)
 
     def padded(self, rows: Rows) -> dict[Key, Floats]:
@@ -320,7 +237,7 @@ class Evidence:
             return known
         missing = [rows for rows in self.extra if id(rows) not in known.crossed]
         if missing:
-            sums, place = _sums(self.parts, self._cross(_made(columns), self._together(missing))), 0
+            sums, place = block_sums(self.parts, self._cross(_made(columns), self._together(missing))), 0
             for rows in missing:
                 known.crossed[id(rows)] = sums[:, :, place : place + _width(rows)]
                 place += _width(rows)
@@ -364,7 +281,7 @@ class Evidence:
         total, places = np.zeros((self.blocks, k, width)), np.arange(width)
         # In a fixed order: the last digits of a sum depend on it.
         for key in sorted(a.keys() & b.keys()):
-            _add_products(a[key], b[key], self._starts[key[0]], self._weights[key], places, total)
+            add_products(a[key], b[key], self._starts[key[0]], self._weights[key], places, total)
         return total
 
     def alone(self, columns: Mapping[Key, Floats]) -> Products:
@@ -376,14 +293,14 @@ class Evidence:
         places = np.arange(width)
         for key, wide in columns.items():
             starts, weight = self._starts[key[0]], self._weights[key]
-            _add_products(wide, self._columns[key], starts, weight, self._acting[key], base)
-            _add_products(wide, wide, starts, weight, places, own)
-            _add_products(wide, self._targets[key], starts, weight, places[:1], target)
+            add_products(wide, self._columns[key], starts, weight, self._acting[key], base)
+            add_products(wide, wide, starts, weight, places, own)
+            add_products(wide, self._targets[key], starts, weight, places[:1], target)
         return Products(base, own, target[:, :, 0], self.parts)
 
     def information(self, products: Products) -> float:
         """Mean fall of the chi-square for a unit of a group's coefficients beside the base parameters alone."""
-        left = _left(products.alone.sum(axis=0), products.own.sum(axis=0), self._base_inverse)
+        left = left_beside(products.alone.sum(axis=0), products.own.sum(axis=0), self._base_inverse)
         return float(np.mean(np.maximum(left, 0.0)))
 
     @cached_property
@@ -392,7 +309,7 @@ class Evidence:
         gram = self._base_gram.sum(axis=0)
         if self.prior is not None:
             gram = gram + self.prior[0]
-        return _inverse(gram, 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300)))
+        return inverse_of(gram, 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300)))
 
     # ---- scores ----
 
@@ -423,8 +340,8 @@ class Evidence:
         """Score of columns in the rows of `keys` from their products with all present columns."""
         base, own, target = products.sums
         whole = base.sum(axis=0), own.sum(axis=0), target.sum(axis=0)
-        schur = _schur((whole[0][None], whole[1][None], whole[2][None]), self.full, ridge)
-        (projection,), (inner,), (moment,), (sound,) = schur
+        one = whole[0][None], whole[1][None], whole[2][None]
+        (projection,), (inner,), (moment,), (sound,) = schur(one, self.full, ridge)
         k = products.own.shape[1]
         if not sound:
             return Score(-np.inf, 0.0, np.zeros(k), 0.0, lambda: (np.eye(k), 0), 1.0)
@@ -443,7 +360,7 @@ class Evidence:
         gain = min(gain, fitted)
         if self._free is not None:
             # A cause explained by base parameters without the prior could only make up for a wrong drawing.
-            left = _left(whole[0], whole[1], self._free.inverse)
+            left = left_beside(whole[0], whole[1], self._free.inverse)
             gain = min(gain, 0.0) if np.all(left < _OWN_SHARE * np.diag(whole[1])) else gain
         values, gram, torque = self.full.values - projection @ coefficients, self.gram, self.target
 
@@ -454,7 +371,7 @@ class Evidence:
             size = np.einsum("bkk->b", products.own)
             active = int(np.sum(size > 1e-3 * size.max(initial=0.0)))
             middle = active / max(active - 1, 1) * scores.T @ scores
-            return _widened(inner @ middle @ inner, inner), active
+            return widened(inner @ middle @ inner, inner), active
 
         return Score(gain, fitted, coefficients, gain / max(rows, 1.0), robust)
 
@@ -467,9 +384,9 @@ class Evidence:
         gain = score.fitted - penalty if np.isfinite(score.gain) else -np.inf
         return replace(score, gain=gain, chance=p)
 
-    def _held_gain(self, mine: _Sums, rest: _Sums, ridge: float) -> float:
+    def _held_gain(self, mine: Sums, rest: Sums, ridge: float) -> float:
         """Fall of the chi-square on each part of the motion, the columns fitted on the rest; the sum of all parts."""
-        projection, inner, moment, _ = _schur(rest, self._held, ridge)
+        projection, inner, moment, _ = schur(rest, self._held, ridge)
         cross, own, target = mine
         c = inner @ moment[:, :, None]
         change = -(projection @ c)
@@ -529,7 +446,7 @@ class Evidence:
         # A product with its own transpose keeps every variance above zero by rounding, and every correlation below one.
         moved = np.sqrt(self.blocks / max(self.blocks - 1, 1)) * scores @ fit.inverse
         sandwich = moved.T @ moved
-        return _widened(sandwich, fit.inverse)
+        return widened(sandwich, fit.inverse)
 
     def free(self, around_zero: Sequence[Rows] = (), std: float = 0.0) -> tuple[Floats, Floats]:
         """Base parameters (p,) by these sessions alone, without the prior, and their covariance (p, p).
@@ -552,7 +469,7 @@ class Evidence:
         """Inverse (p, p) of the base's products without the prior: times those of a column, the change of the base
         parameters that takes it up."""
         gram = self._base_gram.sum(axis=0)
-        return _inverse(gram, self._scale[: self.base_count])
+        return inverse_of(gram, self._scale[: self.base_count])
 
     @property
     def chi_square(self) -> float:
@@ -565,76 +482,5 @@ def _width(rows: Rows) -> int:
     return next(iter(rows.values())).shape[1]
 
 
-def _inverse(gram: Floats, scale: Floats) -> Floats:
-    """Inverse (P, P) of products scaled to a diagonal near one."""
-    both = np.outer(scale, scale)
-    scaled = gram * both
-    # Keeps directions without excitation finite; 1e-9 of the diagonal decides nothing else.
-    scaled[np.diag_indices_from(scaled)] += 1e-9
-    return np.asarray(np.linalg.inv(scaled) * both)
-
-
-def _left(cross: Floats, own: Floats, inverse: Floats) -> Floats:
-    """Squares (k,) of columns beside others: products with those (k, P), among themselves (k, k), inverse (P, P)."""
-    return np.asarray(np.diag(own) - np.einsum("kp,pq,kq->k", cross, inverse, cross))
-
-
 def _made(columns: _Columns) -> Mapping[Key, Floats]:
     return columns() if callable(columns) else columns
-
-
-@njit(cache=True, nogil=True)
-def _add_products(one, other, starts, weight, places, out):  # type: ignore[no-untyped-def]
-    """Add the weighted products of (r, k) and (r, l) in each block to the `places` (l,) of (blocks, k, p)."""
-    k, width = one.shape[1], other.shape[1]
-    total = np.zeros((k, width))
-    for block in range(len(starts) - 1):
-        acts = False
-        for row in range(starts[block], starts[block + 1]):
-            for i in range(k):
-                value = weight * one[row, i]
-                if value != 0.0:
-                    acts = True
-                    for j in range(width):
-                        total[i, j] += value * other[row, j]
-        if acts:
-            for i in range(k):
-                for j in range(width):
-                    out[block, i, places[j]] += total[i, j]
-                    total[i, j] = 0.0
-
-
-def _sums(parts: Floats, values: Floats) -> Floats:
-    """Sums (parts, k, l) of values (blocks, k, l) over the blocks of each part."""
-    return (parts @ values.reshape(len(values), -1)).reshape(len(parts), *values.shape[1:])
-
-
-def _schur(products: _Sums, fit: Fit, ridge: float) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
-    """Projection on the base (m, P, k), inverse of the Schur complement (m, k, k), and product with the residual (m, k)
-    of columns with the products base (m, k, P), own (m, k, k) and target (m, k) in each of m sets of rows.
-
-    Last (m,), whether the columns are something of their own beside the base; the inverse is zero elsewhere.
-    """
-    cross, own, target = products
-    projection = fit.inverse @ cross.transpose(0, 2, 1)
-    inner = own - cross @ projection
-    power, left = np.einsum("mkk->mk", own), np.einsum("mkk->mk", inner)
-    sound = ((power > 0.0) & (left >= _LEAST_LEFT * power)).all(axis=1)
-    moment = target - (cross @ fit.values[..., None])[:, :, 0]
-    eye, at = np.eye(power.shape[1]), sound[:, None, None]
-    root = np.sqrt(np.where(sound[:, None], left + ridge * power, 1.0))
-    both = root[:, :, None] * root[:, None, :]
-    if len(eye) == 1:
-        # Most groups are one column.
-        return projection, at / both, moment, sound
-    scaled = np.where(at, (inner + ridge * power[:, :, None] * eye) / both, eye)
-    sound = sound & (np.linalg.eigvalsh(scaled)[:, 0] >= 1e-9)
-    at = sound[:, None, None]
-    return projection, at * np.linalg.inv(np.where(at, scaled, eye)) / both, moment, sound
-
-
-def _widened(sandwich: Floats, independent: Floats) -> Floats:
-    """A covariance from blocks, its standard deviations at least those of independent rows."""
-    floor = np.sqrt(np.maximum(np.diag(independent), 0.0) / np.maximum(np.diag(sandwich), 1e-300))
-    widen = np.maximum(floor, 1.0)
-    return sandwich * np.outer(widen, widen)

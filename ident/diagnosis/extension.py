@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
-from ident.diagnosis.evidence import Rows
 from ident.diagnosis.held_out import HeldOut, held_out, interval, worse_rows
 from ident.diagnosis.probes import Remainder
+from ident.diagnosis.products import Rows
 from ident.diagnosis.result import Finding, Nameless
 from ident.diagnosis.task import Baseline
 from ident.effects import NAMELESS, entry_of

@@ -8,10 +8,10 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.candidates import Trial
-from ident.diagnosis.evidence import Floats, Key
 from ident.diagnosis.held_out import HeldOut, interval
 from ident.diagnosis.intervals import estimated
 from ident.diagnosis.model_form import companions
+from ident.diagnosis.products import Floats, Key
 from ident.diagnosis.recording import SessionRecord, sensor_limits
 from ident.diagnosis.reference import DELAY_STD_S
 from ident.diagnosis.result import Evident, Finding, Value

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:  # the words about a diagnosis need a constant of this module, and no search
-    from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
+    from ident.diagnosis.evidence import Evidence
+    from ident.diagnosis.products import Floats, Key, Rows
 
 _DRAWS = 1000
 FELT_WORSE = 0.01

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.diagnosis.candidates import Dictionary, Trial
-from ident.diagnosis.evidence import Evidence, Floats, Key, Rows
+from ident.diagnosis.evidence import Evidence
+from ident.diagnosis.products import Floats, Key, Rows
 
 # Largest last step of a shape parameter over its value, for the linearisation to hold.
 _NEAR = 0.3

@@ -16,7 +16,7 @@ import numpy as np
 from fri.errors import DataError
 from ident.diagnosis.bench import ArmData, DiagnosisBench
 from ident.diagnosis.candidates import Candidate
-from ident.diagnosis.evidence import Floats, Rows
+from ident.diagnosis.products import Floats, Rows
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Diagnosis, Finding
 from ident.diagnosis.rivals import margin

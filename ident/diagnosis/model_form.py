@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from ident.diagnosis.candidates import Dictionary, Trial
-from ident.diagnosis.evidence import Floats, Key, Rows
 from ident.diagnosis.probes import groups, hats_of
+from ident.diagnosis.products import Floats, Key, Rows
 from ident.effects import ZERO_OFFSET, Column, Shape
 from ident.effects.effect import both_sides
 from ident.effects.motion import ArmMotion

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
-from ident.diagnosis.evidence import Floats, Rows
 from ident.diagnosis.extension import Member, held_out_with, nameless_terms
 from ident.diagnosis.held_out import HeldOut
 from ident.diagnosis.nominal_arm import GAIN_STD
+from ident.diagnosis.products import Floats, Rows
 from ident.diagnosis.result import Finding, Nameless
 from ident.diagnosis.selection import Selection
 from ident.diagnosis.task import Baseline, ModelFit, State, Task

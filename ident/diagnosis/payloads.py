@@ -15,7 +15,7 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import LIMITS, Grounds, probability
-from ident.diagnosis.evidence import Floats
+from ident.diagnosis.products import Floats
 from ident.diagnosis.reference import WEIGHED, Reference, announced_masses, last_body
 from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.task import Task

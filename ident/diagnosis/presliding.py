@@ -9,9 +9,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.diagnosis.evidence import Evidence, Floats
+from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.nominal import Nominal
 from ident.diagnosis.nominal_arm import NominalArm
+from ident.diagnosis.products import Floats
 from ident.effects.motion import dahl
 
 # Initial presliding lengths [rad], and least fall of the misfit over the noise.

@@ -16,8 +16,10 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from ident.diagnosis.candidates import Dictionary
-from ident.diagnosis.evidence import Evidence, Floats, Key, Products, Rows, Score
+from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.nominal import TRAVEL_RAD
+from ident.diagnosis.products import Floats, Key, Products, Rows
+from ident.diagnosis.score import Score
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import NAMELESS, Column
 from ident.effects.motion import ArmMotion

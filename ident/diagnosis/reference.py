@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from ident.diagnosis.evidence import Floats
 from ident.diagnosis.nominal_arm import GAIN_STD
+from ident.diagnosis.products import Floats
 from ident.diagnosis.usual_sizes import Healthy, UsualSize, scatter_limits
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import LINK_FRICTION, PER_LINK, split_name

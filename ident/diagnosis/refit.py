@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from ident.diagnosis.evidence import Floats
 from ident.diagnosis.held_out import HeldOut
 from ident.diagnosis.nominal import Nominal
+from ident.diagnosis.products import Floats
 from ident.diagnosis.recording import RecordStretch
 from ident.diagnosis.task import Task
 from ident.dynamics.structure import Side

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ident.diagnosis.broken_data import BrokenChannel
 from ident.diagnosis.claims_in_words import finding_statement
-from ident.diagnosis.evidence import Floats
+from ident.diagnosis.products import Floats
 from ident.diagnosis.statements import Statements, statements
 from ident.diagnosis.torque_errors import TorqueErrors
 from ident.dynamics.tables import Tabular

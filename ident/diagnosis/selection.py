@@ -15,9 +15,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ident.diagnosis.candidates import Candidate, Dictionary, Trial
-from ident.diagnosis.evidence import Evidence, Floats, Key, Rows, Score
+from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.model_form import model_form_error
+from ident.diagnosis.products import Floats, Key, Rows
 from ident.diagnosis.rivals import confidence, exceeds, look_alikes
+from ident.diagnosis.score import Score
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.tolerances import HABIT, HABITUAL, LENGTH, SIZE, Tolerance, tolerances, usual_change
 from ident.diagnosis.usual_sizes import Healthy

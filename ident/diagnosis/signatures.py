@@ -17,7 +17,7 @@ import numpy as np
 from fri.errors import DataError
 from ident.diagnosis.bench import ArmData, DiagnosisBench, nominal_arm, prepare_bench
 from ident.diagnosis.candidates import Candidate, Trial
-from ident.diagnosis.evidence import Floats, Key, Rows
+from ident.diagnosis.products import Floats, Key, Rows
 from ident.diagnosis.recording import record, settled
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.selection import select

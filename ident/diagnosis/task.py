@@ -9,9 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench, prepare_bench
-from ident.diagnosis.evidence import Evidence, Floats, Rows
+from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.held_out import HeldOut, held_out
 from ident.diagnosis.nominal_arm import NominalArm
+from ident.diagnosis.products import Floats, Rows
 from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Finding, SimulationError

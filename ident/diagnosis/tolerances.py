@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ident.diagnosis.candidates import Candidate, Dictionary
-from ident.diagnosis.evidence import Evidence, Rows
+from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.nominal_arm import NominalArm
+from ident.diagnosis.products import Rows
 from ident.diagnosis.reference import USUAL_CHANGES
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import (

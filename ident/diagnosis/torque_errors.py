@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ident.diagnosis.evidence import Floats
 from ident.diagnosis.held_out import FELT_WORSE
+from ident.diagnosis.products import Floats
 from ident.estimation.identify import Known
 from ident.estimation.scores import SessionScore
 from ident.estimation.validate import validate

@@ -14,7 +14,8 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 from ident.diagnosis.candidates import Dictionary
-from ident.diagnosis.evidence import Floats, Score
+from ident.diagnosis.products import Floats
+from ident.diagnosis.score import Score
 from ident.estimators.estimate import fisher_limit
 
 # Least square of a size over its variance for a factor between the two.

@@ -18,9 +18,9 @@ import numpy as np
 
 from ident.diagnosis.bench import DiagnosisBench
 from ident.diagnosis.confidence import HARDLY
-from ident.diagnosis.evidence import Floats, Rows
 from ident.diagnosis.held_out import HeldOut
 from ident.diagnosis.probes import Remainder, find_remainders
+from ident.diagnosis.products import Floats, Rows
 from ident.diagnosis.reference import INERTIA_BY_PHASE, Reference
 from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.selection import Claim

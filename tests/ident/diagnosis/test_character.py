@@ -12,7 +12,7 @@ import pytest
 from ident.diagnosis import commission, diagnose
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.character import Size, _carried, _kind, _Set
-from ident.diagnosis.evidence import Score
+from ident.diagnosis.score import Score
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, Shape, parameter_values

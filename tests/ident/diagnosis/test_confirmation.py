@@ -11,9 +11,9 @@ import pytest
 
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.confirmation import _refuted
-from ident.diagnosis.evidence import Score
 from ident.diagnosis.findings import sizeless
 from ident.diagnosis.result import Evident, Finding, Value
+from ident.diagnosis.score import Score
 from ident.diagnosis.selection import Claim
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import EFFECTS, Shape

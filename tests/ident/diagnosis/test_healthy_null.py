@@ -13,10 +13,10 @@ from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.channel_delays import common_delays
 from ident.diagnosis.commission import as_stated
 from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std
-from ident.diagnosis.evidence import Score
 from ident.diagnosis.nominal_arm import GAIN_STD, NominalArm
 from ident.diagnosis.presliding import with_far_presliding
 from ident.diagnosis.reference import DELAY_STD_S, Reference
+from ident.diagnosis.score import Score
 from ident.diagnosis.selection import State
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.tolerances import Tolerance

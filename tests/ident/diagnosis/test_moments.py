@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ident.diagnosis.candidates import Candidate, Dictionary, Trial
-from ident.diagnosis.evidence import Score
+from ident.diagnosis.score import Score
 from ident.diagnosis.selection import State, _same_moment
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import EFFECTS, Shape

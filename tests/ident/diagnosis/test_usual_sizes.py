@@ -12,7 +12,7 @@ from fri.errors import ConfigurationError
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.confidence import Grounds
 from ident.diagnosis.confirmation import _plain
-from ident.diagnosis.evidence import Score
+from ident.diagnosis.score import Score
 from ident.diagnosis.selection import Claim, State
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.usual_sizes import Healthy, UsualSize, scatter_limits, usual_sizes

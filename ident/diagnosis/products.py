@@ -1,0 +1,128 @@
+"""Products of columns in blocks of rows, and least squares on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+# A column with less than this share of its power beside the base carries no information of its own.
+_LEAST_LEFT = 1e-5
+
+Key = tuple[str, int]
+Rows = Mapping[Key, Floats]
+"""Columns in rows: (m, k) for each side and joint with non-zero entries."""
+Sums = tuple[Floats, Floats, Floats]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Least-squares values (P,) of base and further columns, and the inverse Gram matrix (P, P)."""
+
+    values: Floats
+    inverse: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Products of a group's columns with the base, among themselves and with the torques in each block.
+
+    alone : (blocks, k, p) with the base parameters; own (blocks, k, k); target (blocks, k). parts : (parts, blocks),
+    1 for the blocks of a part held back in turn. further : makes those with the further columns (blocks, k, w) on
+    demand; further_sums : their sums (parts, k, w). crossed : such sums by group of further columns, as met so far.
+    """
+
+    alone: Floats
+    own: Floats
+    target: Floats
+    parts: Floats
+    further: Callable[[], Floats] | None = None
+    further_sums: Floats | None = None
+    crossed: dict[int, Floats] = field(default_factory=dict)
+
+    @cached_property
+    def base(self) -> Floats:
+        """(blocks, k, P) with base and further columns."""
+        return self.alone if self.further is None else np.concatenate([self.alone, self.further()], axis=2)
+
+    @cached_property
+    def sums(self) -> Sums:
+        """Base, own and target of each part."""
+        base = block_sums(self.parts, self.alone)
+        if self.further_sums is not None:
+            base = np.concatenate([base, self.further_sums], axis=2)
+        return base, block_sums(self.parts, self.own), self.parts @ self.target
+
+    def only(self, on: Floats) -> Products:
+        """Products of the blocks with weight 1 in `on` (blocks,) alone."""
+        wide = on[:, None, None]
+        return Products(self.base * wide, self.own * wide, self.target * on[:, None], self.parts)
+
+
+def inverse_of(gram: Floats, scale: Floats) -> Floats:
+    """Inverse (P, P) of products scaled to a diagonal near one."""
+    both = np.outer(scale, scale)
+    scaled = gram * both
+    # Keeps directions without excitation finite; 1e-9 of the diagonal decides nothing else.
+    scaled[np.diag_indices_from(scaled)] += 1e-9
+    return np.asarray(np.linalg.inv(scaled) * both)
+
+
+def left_beside(cross: Floats, own: Floats, inverse: Floats) -> Floats:
+    """Squares (k,) of columns beside others: products with those (k, P), among themselves (k, k), inverse (P, P)."""
+    return np.asarray(np.diag(own) - np.einsum("kp,pq,kq->k", cross, inverse, cross))
+
+
+@njit(cache=True, nogil=True)
+def add_products(one, other, starts, weight, places, out):  # type: ignore[no-untyped-def]
+    """Add the weighted products of (r, k) and (r, l) in each block to the `places` (l,) of (blocks, k, p)."""
+    k, width = one.shape[1], other.shape[1]
+    total = np.zeros((k, width))
+    for block in range(len(starts) - 1):
+        acts = False
+        for row in range(starts[block], starts[block + 1]):
+            for i in range(k):
+                value = weight * one[row, i]
+                if value != 0.0:
+                    acts = True
+                    for j in range(width):
+                        total[i, j] += value * other[row, j]
+        if acts:
+            for i in range(k):
+                for j in range(width):
+                    out[block, i, places[j]] += total[i, j]
+                    total[i, j] = 0.0
+
+
+def block_sums(parts: Floats, values: Floats) -> Floats:
+    """Sums (parts, k, l) of values (blocks, k, l) over the blocks of each part."""
+    return (parts @ values.reshape(len(values), -1)).reshape(len(parts), *values.shape[1:])
+
+
+def schur(products: Sums, fit: Fit, ridge: float) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+    """Projection on the base (m, P, k), inverse of the Schur complement (m, k, k), and product with the residual (m, k)
+    of columns with the products base (m, k, P), own (m, k, k) and target (m, k) in each of m sets of rows.
+
+    Last (m,), whether the columns are something of their own beside the base; the inverse is zero elsewhere.
+    """
+    cross, own, target = products
+    projection = fit.inverse @ cross.transpose(0, 2, 1)
+    inner = own - cross @ projection
+    power, left = np.einsum("mkk->mk", own), np.einsum("mkk->mk", inner)
+    sound = ((power > 0.0) & (left >= _LEAST_LEFT * power)).all(axis=1)
+    moment = target - (cross @ fit.values[..., None])[:, :, 0]
+    eye, at = np.eye(power.shape[1]), sound[:, None, None]
+    root = np.sqrt(np.where(sound[:, None], left + ridge * power, 1.0))
+    both = root[:, :, None] * root[:, None, :]
+    if len(eye) == 1:
+        # Most groups are one column.
+        return projection, at / both, moment, sound
+    scaled = np.where(at, (inner + ridge * power[:, :, None] * eye) / both, eye)
+    sound = sound & (np.linalg.eigvalsh(scaled)[:, 0] >= 1e-9)
+    at = sound[:, None, None]
+    return projection, at * np.linalg.inv(np.where(at, scaled, eye)) / both, moment, sound
