@@ -16,14 +16,15 @@ import numpy as np
 
 from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence
+from ident.diagnosis.healthy_null import HealthyNull
 from ident.diagnosis.model_form import model_form_error
 from ident.diagnosis.products import Floats, Key, Rows
 from ident.diagnosis.rivals import confidence, exceeds, look_alikes
 from ident.diagnosis.score import Score
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.diagnosis.tolerances import HABIT, HABITUAL, LENGTH, SIZE, Tolerance, tolerances, usual_change
+from ident.diagnosis.tolerances import HABIT, LENGTH, SIZE, Tolerance, tolerances
 from ident.diagnosis.usual_sizes import Healthy
-from ident.effects import EFFECTS, Shape
+from ident.effects import EFFECTS
 
 log = logging.getLogger(__name__)
 
@@ -53,9 +54,6 @@ _EITHER = 0.5
 _CERTAIN = 3.0
 # Latest sets of columns whose best shapes are kept.
 _LATEST = 6
-# Least and largest ratio of the information to that of the healthy sets: less of it makes no limit smaller, for what
-# the model lacks differs from motion to motion, too.
-_INFORMATION = (1.0, 25.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,9 +200,13 @@ class State:
     healthy: Healthy = field(default_factory=Healthy)
     nuisance: dict[str, tuple[float, float]] = field(default_factory=dict)
     nuisance_rows: list[Rows] = field(default_factory=list)
+    null: HealthyNull = field(init=False)
     _tolerances: list[Tolerance] | None = None
     _accepted: Sequence[Trial] = ()
     _latest: dict[tuple[int, ...], list[Trial]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.null = HealthyNull(self.dictionary, self.settings, self.healthy)
 
     # ---- tolerated deviations ----
 
@@ -276,7 +278,7 @@ class State:
 
     def rivals(self) -> list[Trial]:
         """The simplest candidates by their gain, best first. A gain as on the healthy arm explains nothing."""
-        found = [t for t in self.simplest() if self.unusual(t)]
+        found = [t for t in self.simplest() if self.null.exceeded(t)]
         return sorted(found, key=_gain, reverse=True)
 
     def next(self, accepted: Sequence[Trial], carried: list[Trial]) -> Trial | None:
@@ -307,28 +309,6 @@ class State:
                 return True
         return False
 
-    def usual(self, trial: Trial) -> float:
-        """Upper limit of the gain of such a trial on a healthy arm, see `_limit`."""
-        return self._limit(
-            trial.candidate, self.healthy.limits.get(trial.candidate.key, 0.0), self.dictionary.nearest(trial)
-        )
-
-    def unusual(self, trial: Trial) -> bool:
-        """Whether a trial is more than on a healthy arm: its difference from the usual size. Its gain alone suffices
-        where the healthy sets have no clear size."""
-        candidate, more = trial.candidate, trial.score.gain > self.usual(trial)
-        usual = self.healthy.sizes.get(candidate.key)
-        here = None if usual is None else self.dictionary.scored(candidate, usual[0].shape)
-        if usual is None or here is None:
-            return more
-        size, limit = usual
-        change = size.beyond(here)
-        other = trial.score.gain - max(here.gain, 0.0)
-        # Days alike by chance have a limit below that of noise.
-        limit = max(self._limit(candidate, limit, size.shape), self._least(candidate, here))
-        changed = change > 0.0 and change + other > limit
-        return changed or (more and not size.clear(here, self._limit(candidate, size.scatter, size.shape)))
-
     def _by_habits(self, trial: Trial) -> bool:
         """Whether a trial is more than on a healthy arm only beside habits in its rows: the healthy sets were without
         them, and columns of friction share it among them."""
@@ -342,7 +322,7 @@ class State:
         self._tolerances = others
         self.tolerate(self._accepted)
         alone = self.dictionary.trial(trial.candidate, trial.shape, self.choices(trial))
-        found = alone is None or not self.unusual(alone)
+        found = alone is None or not self.null.exceeded(alone)
         self._tolerances, self.nuisance, self.nuisance_rows = known, nuisance, rows
         self.evidence.replace(present)
         return found
@@ -371,30 +351,6 @@ class State:
             if alike and np.var(torque) <= np.var(largest):
                 return True
         return False
-
-    def _least(self, candidate: Candidate, score: Score) -> float:
-        """Least gain of a claim."""
-        return self.settings.least_of_claim(candidate.effect.evidence_factor, len(score.coefficients))
-
-    def _limit(self, candidate: Candidate, limit: float, shape: str) -> float:
-        """The limit of a gain in sessions with as much information on a candidate of a shape.
-
-        Few healthy days may be alike by chance, so it is no less than that of the usual change of a scale.
-        """
-        least = self._scaled(candidate)
-        before = self.healthy.shown.get(candidate.key, {}).get(shape, 0.0)
-        if not limit or before <= 0.0:
-            return max(limit, least)
-        now = self.dictionary.information(candidate).get(shape, 0.0)
-        return max(limit * float(np.clip(now / before, *_INFORMATION)), least)
-
-    def _scaled(self, candidate: Candidate) -> float:
-        """Gain by the largest usual change from day to day of a cause that is a scale, 0 for others and without a
-        reference."""
-        if not candidate.effect.usual_change or not self.healthy.limits:
-            return 0.0
-        largest = HABITUAL * usual_change(candidate.effect, self.dictionary.nominal.arm)
-        return self.dictionary.information(candidate).get(repr(Shape()), 0.0) * largest**2
 
     def refined(self, trial: Trial) -> Trial:
         """The trial with its shape at the best fit, unless cross-validation contradicts that shape."""
@@ -425,16 +381,16 @@ class State:
         gain than on healthy days."""
         score = trial.score if score is None else score
         settings = self.settings
-        least = self._least(trial.candidate, score)
+        least = self.null.least(trial.candidate, score)
         if score.gain <= least:
             return False
-        if healthy and (not self.unusual(trial) or self._by_habits(trial) or self._of_own_law(trial)):
+        if healthy and (not self.null.exceeded(trial) or self._by_habits(trial) or self._of_own_law(trial)):
             return False
         if trial.candidate.effect.seen_in_samples(trial.shape):
             return True
         if score.p_value >= settings.alpha_rare:
             return False
-        least = max(least, self.usual(trial)) if healthy else least
+        least = max(least, self.null.limit(trial)) if healthy else least
         # A brief event is large for a moment, and small in the whole session.
         size = np.inf if trial.candidate.effect.event else score.inflation * self.concentration(trial, score)
         needed = trial.candidate.effect.evidence_factor * settings.least_inflation
@@ -608,7 +564,7 @@ class State:
         # Of many times tried, one always fits to some degree.
         lasting = (t for t in close if not t.candidate.effect.event)
         outdone = any(_gain(t) > _gain(again) and not self.carried(t) for t in lasting)
-        changed_alone = again.score.gain <= self.usual(again)
+        changed_alone = again.score.gain <= self.null.limit(again)
         return Claim(again, again.score, alike, sure, outdone, changed_alone)
 
     def same_torque(self, candidate: Candidate) -> Candidate | None:

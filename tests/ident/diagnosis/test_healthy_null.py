@@ -13,6 +13,7 @@ from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.channel_delays import common_delays
 from ident.diagnosis.commission import as_stated
 from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std
+from ident.diagnosis.healthy_null import HealthyNull
 from ident.diagnosis.nominal_arm import GAIN_STD, NominalArm
 from ident.diagnosis.presliding import with_far_presliding
 from ident.diagnosis.reference import DELAY_STD_S, Reference
@@ -284,8 +285,8 @@ def test_what_is_unusual_beside_a_habit_alone_is_no_claim(monkeypatch: pytest.Mo
         return found
 
     monkeypatch.setattr(State, "tolerate", lambda self, accepted: None)
-    monkeypatch.setattr(State, "unusual", lambda self, trial: trial.score.gain > 500.0)
-    monkeypatch.setattr(State, "usual", lambda self, trial: 0.0)
+    monkeypatch.setattr(HealthyNull, "exceeded", lambda self, trial: trial.score.gain > 500.0)
+    monkeypatch.setattr(HealthyNull, "limit", lambda self, trial: 0.0)
     assert not state(100.0).carried(trial)
     assert state(800.0).carried(trial)
     assert state(100.0).carried(elsewhere)
@@ -302,8 +303,8 @@ def test_a_limit_grows_with_the_information_of_the_motion_and_falls_with_none() 
             nearest=lambda trial: "v", information=lambda candidate, now=now: {"v": now}
         )
         healthy = Healthy({("stribeck", 0): 50.0}, {("stribeck", 0): {"v": 10.0}})
-        state = State(dictionary, None, DiagnosisSettings(), healthy)  # type: ignore[arg-type]
-        assert state.usual(trial) == pytest.approx(limit)
+        null = HealthyNull(dictionary, DiagnosisSettings(), healthy)  # type: ignore[arg-type]
+        assert null.limit(trial) == pytest.approx(limit)
 
 
 def _score(gain: float, count: int = 1) -> Score:

@@ -12,8 +12,9 @@ from fri.errors import ConfigurationError
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.confidence import Grounds
 from ident.diagnosis.confirmation import _plain
+from ident.diagnosis.healthy_null import HealthyNull
 from ident.diagnosis.score import Score
-from ident.diagnosis.selection import Claim, State
+from ident.diagnosis.selection import Claim
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.usual_sizes import Healthy, UsualSize, scatter_limits, usual_sizes
 from ident.effects import EFFECTS, Shape
@@ -77,21 +78,21 @@ def test_a_constant_misfit_hides_no_change_of_the_same_candidate() -> None:
         scored=lambda candidate, shape: trial.score if shape == "v" else None,
     )
 
-    def state(mean: float, change: float, *, limit: float = 1000.0, scatter: float = 1.0) -> State:
+    def null(mean: float, change: float, *, limit: float = 1000.0, scatter: float = 1.0) -> HealthyNull:
         sizes = {KEY: (UsualSize("v", np.array([mean]), scatter), change)}
         healthy = Healthy({KEY: limit}, {KEY: {"v": 100.0}}, sizes)
-        return State(dictionary, None, DiagnosisSettings(), healthy)  # type: ignore[arg-type]
+        return HealthyNull(dictionary, DiagnosisSettings(), healthy)  # type: ignore[arg-type]
 
-    assert state(1.0, 50.0).unusual(trial)
-    assert not state(1.0, 150.0).unusual(trial)
-    assert not state(2.0, 50.0).unusual(trial)
+    assert null(1.0, 50.0).exceeded(trial)
+    assert not null(1.0, 150.0).exceeded(trial)
+    assert not null(2.0, 50.0).exceeded(trial)
     # A gain above that of the healthy days is a finding unless their size is clear and explains it.
-    assert state(2.0, 150.0, limit=100.0, scatter=1e3).unusual(trial)
-    assert not state(2.0, 150.0, limit=100.0).unusual(trial)
+    assert null(2.0, 150.0, limit=100.0, scatter=1e3).exceeded(trial)
+    assert not null(2.0, 150.0, limit=100.0).exceeded(trial)
     # However alike the days were, a change is more than a claim asks for.
-    assert state(1.4, 1.0).unusual(trial)
-    assert not state(1.5, 1.0).unusual(trial)
-    assert not State(dictionary, None, DiagnosisSettings(), Healthy({KEY: 1000.0})).unusual(trial)  # type: ignore[arg-type]
+    assert null(1.4, 1.0).exceeded(trial)
+    assert not null(1.5, 1.0).exceeded(trial)
+    assert not HealthyNull(dictionary, DiagnosisSettings(), Healthy({KEY: 1000.0})).exceeded(trial)  # type: ignore[arg-type]
 
 
 def test_a_claim_by_its_change_alone_is_no_plain_one() -> None:

@@ -1,0 +1,69 @@
+"""What of a trial is more than in the sets of a healthy arm, as much as their motions and the present ones tell."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.diagnosis.candidates import Candidate, Dictionary, Trial
+from ident.diagnosis.score import Score
+from ident.diagnosis.settings import DiagnosisSettings
+from ident.diagnosis.tolerances import HABITUAL, usual_change
+from ident.diagnosis.usual_sizes import Healthy
+from ident.effects import Shape
+
+# Least and largest ratio of the information to that of the healthy sets: less of it makes no limit smaller, for what
+# the model lacks differs from motion to motion, too.
+_INFORMATION = (1.0, 25.0)
+
+
+class HealthyNull:
+    """The gains of candidates that a healthy arm reaches in the present sessions."""
+
+    def __init__(self, dictionary: Dictionary, settings: DiagnosisSettings, healthy: Healthy) -> None:
+        self.dictionary, self.settings, self.healthy = dictionary, settings, healthy
+
+    def limit(self, trial: Trial) -> float:
+        """Upper limit of the gain of such a trial on a healthy arm."""
+        return self._in_these(
+            trial.candidate, self.healthy.limits.get(trial.candidate.key, 0.0), self.dictionary.nearest(trial)
+        )
+
+    def exceeded(self, trial: Trial) -> bool:
+        """Whether a trial is more than on a healthy arm: its difference from the usual size. Its gain alone suffices
+        where the healthy sets have no clear size."""
+        candidate, more = trial.candidate, trial.score.gain > self.limit(trial)
+        usual = self.healthy.sizes.get(candidate.key)
+        here = None if usual is None else self.dictionary.scored(candidate, usual[0].shape)
+        if usual is None or here is None:
+            return more
+        size, limit = usual
+        change = size.beyond(here)
+        other = trial.score.gain - max(here.gain, 0.0)
+        # Days alike by chance have a limit below that of noise.
+        limit = max(self._in_these(candidate, limit, size.shape), self.least(candidate, here))
+        changed = change > 0.0 and change + other > limit
+        return changed or (more and not size.clear(here, self._in_these(candidate, size.scatter, size.shape)))
+
+    def least(self, candidate: Candidate, score: Score) -> float:
+        """Least gain of a claim."""
+        return self.settings.least_of_claim(candidate.effect.evidence_factor, len(score.coefficients))
+
+    def _in_these(self, candidate: Candidate, limit: float, shape: str) -> float:
+        """A limit in the healthy sets, in sessions with as much information on a candidate of a shape.
+
+        Few healthy days may be alike by chance, so it is no less than that of the usual change of a scale.
+        """
+        least = self._scaled(candidate)
+        before = self.healthy.shown.get(candidate.key, {}).get(shape, 0.0)
+        if not limit or before <= 0.0:
+            return max(limit, least)
+        now = self.dictionary.information(candidate).get(shape, 0.0)
+        return max(limit * float(np.clip(now / before, *_INFORMATION)), least)
+
+    def _scaled(self, candidate: Candidate) -> float:
+        """Gain by the largest usual change from day to day of a cause that is a scale, 0 for others and without a
+        reference."""
+        if not candidate.effect.usual_change or not self.healthy.limits:
+            return 0.0
+        largest = HABITUAL * usual_change(candidate.effect, self.dictionary.nominal.arm)
+        return self.dictionary.information(candidate).get(repr(Shape()), 0.0) * largest**2
