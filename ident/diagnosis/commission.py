@@ -30,7 +30,7 @@ from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.presliding import SlowTurns, presliding_length, slow_turns, with_far_presliding
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.products import Floats, Rows
-from ident.diagnosis.recording import SessionRecord, record, settled
+from ident.diagnosis.recording import SessionRecord, record, settled_for_all
 from ident.diagnosis.reference import (
     Reference,
     shared,
@@ -115,8 +115,8 @@ def commission(
         raise DataError("no session given; name at least one healthy session")
     start = replace(nominal_arm(chain, arm, None), encoder_known=True)
     sides: tuple[Side, ...] = ("link", "motor") if np.any(start.compliance > 0.0) else ("link",)
-    settings = settled(settings, parts[0], chain)
     couplings = () if arm is None else arm.couplings
+    settings = settled_for_all(settings, parts[:_TUNING_SETS], chain, couplings)
     recorded: list[list[SessionRecord]] = []
     for part in parts:
         recall = Recall()

@@ -97,7 +97,7 @@ def diagnose(
     couplings, recall = () if arm is None else arm.couplings, Recall()
     broken = broken_channels(everything, chain, settings.signals, couplings, recall=recall)
     with blamed(broken, chain.joint_names):
-        settings = settled(settings, sessions, chain, recall=recall)
+        settings = settled(settings, sessions, chain, couplings, recall=recall)
         recordings = tuple(
             record(s, k, chain, settings, test=id(s) in held, recall=recall) for k, s in enumerate(everything)
         )

@@ -13,7 +13,7 @@ from fri.errors import DataError
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.structure import ModelStructure, Side
+from ident.dynamics.structure import Coupling, ModelStructure, Side
 from ident.rows.content import Recall
 from ident.rows.data_quality import Stuck, clipped_at, passed_band, stuck_at
 from ident.rows.prepare import prepare
@@ -110,10 +110,18 @@ class SessionRecord:
 
 
 def settled(
-    settings: DiagnosisSettings, sessions: Sequence[Session], chain: Chain, *, recall: Recall | None = None
+    settings: DiagnosisSettings,
+    sessions: Sequence[Session],
+    chain: Chain,
+    couplings: Sequence[Coupling] = (),
+    *,
+    recall: Recall | None = None,
 ) -> DiagnosisSettings:
-    """The settings with signals and friction law from the fitted sessions, as `identify` chooses them. recall : as for
-    `prepare`."""
+    """The settings with signals and friction law from the fitted sessions, as `identify` chooses them.
+
+    couplings : of the arm. recall : as for `prepare`.
+    """
+    settings = replace(settings, signals=settings.signals.of_coupled(couplings))
     chosen = [session.select(chain.joint_names) for session in sessions]
     payloads = [payload_name(session) for session in chosen]
     sensed = any(bool(session.joint.effort.shape[1]) for session in chosen)
@@ -122,6 +130,7 @@ def settled(
         chain,
         2 if motor else 1,
         tuple(dict.fromkeys(p for p in payloads if p is not None)),
+        couplings=tuple(couplings),
         sides=() if sensed else ("motor",),
     )
     try:
@@ -135,6 +144,28 @@ def settled(
         logger.info("signal settings of the paper, because: %s", error)
         return settings
     return replace(settings, signals=found.settings, law=found.coulomb, row_law=found.row_coulomb)
+
+
+def settled_for_all(
+    settings: DiagnosisSettings,
+    sets: Sequence[Sequence[Session]],
+    chain: Chain,
+    couplings: Sequence[Coupling] = (),
+) -> DiagnosisSettings:
+    """`settled` for the first of several sets of one arm, leaving out what any of them asks for.
+
+    Presliding and the friction of slow motion are the drives'; a set whose motion does not show them leaves nothing
+    out.
+    """
+    first, *others = [settled(settings, sessions, chain, couplings) for sessions in sets]
+    chosen = [one.signals for one in (first, *others)]
+    signals = replace(
+        first.signals,
+        reversal_s=max(one.reversal for one in chosen),
+        turning_rad=max(one.turning for one in chosen),
+        slow_rad_s=max(one.slow for one in chosen),
+    )
+    return replace(first, signals=signals)
 
 
 def record(

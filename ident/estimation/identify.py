@@ -433,6 +433,7 @@ def observed(
         )
     payloads = [payload_name(session) for session in chosen]
     carried = tuple(dict.fromkeys(p for p in payloads if p is not None)) if settings.model != 3 else ()
+    settings = replace(settings, signals=settings.signals.of_coupled(settings.couplings))
     structure = ModelStructure(
         chain,
         settings.model,

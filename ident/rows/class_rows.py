@@ -26,7 +26,7 @@ class ClassRows:
     """Rows of one joint and side of all sessions.
 
     matrix : (m, a), the columns `acting` (a,) of the `width` p of the model, those that are not zero: the joint's own
-    and those of the links behind it. torque, speed : (m,).
+    and those of the links behind it. torque, speed : (m,). shared : (m, k), speeds of the drives shared with others.
     measured : (m,), neither bridged nor outliers. block : (m,), number of its block. parts, stretches : the rows of all
     joints of each stretch, and their places here.
     """
@@ -34,6 +34,7 @@ class ClassRows:
     matrix: Floats
     torque: Floats
     speed: Floats
+    shared: Floats
     measured: NDArray[np.bool_]
     block: NDArray[np.int64]
     parts: tuple[BinnedRows, ...]
@@ -51,13 +52,19 @@ class ClassRows:
         return np.asarray(self.block % 2 == 0)
 
     def known(self, bins: int, standstill_rad_s: float, turning_rad: float) -> NDArray[np.bool_]:
-        """Measured rows (m,) more than `bins` rows and the path `turning_rad` from a reversal."""
+        """Measured rows (m,) more than `bins` rows and the path `turning_rad` from a reversal of the joint or of a
+        drive that it shares."""
         found = self.measured.copy()
+        speed = np.column_stack([self.speed, self.shared])
         for some in self.stretches:
-            speed = self.speed[some, None]
-            away = away_from_reversals(speed, BIN_S, bins * BIN_S, standstill_rad_s, turning_rad)
-            found[some] &= away[:, 0]
+            away = away_from_reversals(speed[some], BIN_S, bins * BIN_S, standstill_rad_s, turning_rad)
+            found[some] &= away.all(axis=1)
         return found
+
+    def faster(self, speed_rad_s: float) -> NDArray[np.bool_]:
+        """Rows (m,) in which the joint and each drive that it shares are faster than this."""
+        speed = np.column_stack([self.speed, self.shared])
+        return np.asarray((np.abs(speed) > speed_rad_s).all(axis=1))
 
 
 ByClass = dict[tuple[str, int], ClassRows]

@@ -28,7 +28,7 @@ from ident.rows.filters import (
     thinning,
 )
 from ident.rows.prepared import BoolArray, TorqueChannel
-from ident.rows.reversals import away_from_reversals, turning_reach
+from ident.rows.reversals import away_of_drives, turning_reach
 from ident.rows.timebase import Stretch
 from lwr_driver.session.spool import LEAST_BYTES, release, shelved
 
@@ -136,11 +136,11 @@ class Motion:
         core: tuple[float, float],
         wide: WideMotion,
         settings: SignalSettings,
+        coupled: Sequence[tuple[int, int]],
     ) -> Motion:
-        """The samples from span[0] to before span[1] of `wide`."""
+        """The samples from span[0] to before span[1] of `wide`. coupled : pairs of joints with a drive in common."""
         beside = settings.reversal, settings.standstill_rad_s, settings.turning
-        away = away_from_reversals(wide.qd, part.dt, *beside)
-        away &= np.abs(wide.qd) > settings.slow
+        away = away_of_drives(wide.qd, part.dt, *beside, slow_rad_s=settings.slow, coupled=coupled)
         kept = slice(span[0] - wide.low, span[1] - wide.low)
         states = wide.q[kept], wide.qd[kept], wide.qdd[kept], wide.torque[kept]
         drive = None if wide.drive is None else wide.drive.at(kept)
@@ -249,16 +249,20 @@ def filtered_motions(
     parts: list[Stretch],
     wide: Callable[[Stretch, int, int], WideMotion],
     settings: SignalSettings,
+    coupled: Sequence[tuple[int, int]],
     blocks: bool,
 ) -> Iterator[Motion]:
-    """The motions of all stretches, block after block. wide : the samples of a stretch between two numbers."""
+    """The motions of all stretches, block after block.
+
+    wide : the samples of a stretch between two numbers. coupled : pairs of joints with a drive in common.
+    """
     seen = turning_reach(settings.reversal, settings.standstill_rad_s, settings.turning)
     for part in parts:
         needed = settling(settings.cutoff, settings.order) + seen + abs(settings.joint_delay)
         around = int(np.ceil(needed / part.dt)) + 16
         for span, core in _cut(part, settings, blocks):
             low, high = max(span[0] - around, 0), min(span[1] + around, part.count)
-            yield Motion.of(part, span, core, wide(part, low, high), settings)
+            yield Motion.of(part, span, core, wide(part, low, high), settings, coupled)
 
 
 def excitation_hz(motions: Sequence[Motion], part: Stretch, dt: float, cutoff_hz: float) -> float:

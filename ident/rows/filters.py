@@ -6,7 +6,7 @@ The spectrum of the motion gives the excitation, and with it the band of the row
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Literal
@@ -19,6 +19,7 @@ from scipy.ndimage import correlate1d
 from fri.errors import ConfigurationError
 from fri.quantities import within
 from ident.dynamics.parameters import Floats
+from ident.dynamics.structure import Coupling
 from ident.rows.butterworth import forward_and_back, sections, spectrum
 from ident.rows.reversals import TURNING_RAD
 
@@ -62,6 +63,8 @@ class SignalSettings:
     stiffness_nm_rad : of the joints, for the motors' motion against the links: the joint torque twists a joint, and
         the drive's friction and inertia act on the motor. Without it an elastic joint makes the motor channel look
         early by Fvm / stiffness. None: rigid joints.
+    coupled : pairs of joints whose drives are coupled, see `Coupling`. Samples beside a reversal of the drive that they
+        share have no part in the rows of both.
     """
 
     cutoff_hz: Frequency | None = None
@@ -82,6 +85,7 @@ class SignalSettings:
     joint_delay_s: DelaySetting = "estimate"
     delay_search_s: Annotated[float, within(0.0, 10.0, "s", above=True)] = 0.1
     stiffness_nm_rad: tuple[Annotated[float, within(0.0, 1e12, "Nm/rad", above=True)], ...] | None = None
+    coupled: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
         positive = (
@@ -159,6 +163,18 @@ class SignalSettings:
     def joint_delay(self) -> float:
         """Delay of the joint torques in use [s], zero until it is estimated."""
         return 0.0 if self.joint_delay_s == "estimate" else float(self.joint_delay_s)
+
+    def of_coupled(self, couplings: Iterable[Coupling]) -> SignalSettings:
+        """The same for an arm with these couplings, where none are stated."""
+        return replace(self, coupled=self.coupled or tuple(pair.joints for pair in couplings))
+
+    def coupled_places(self, joint_names: Sequence[str]) -> tuple[tuple[int, int], ...]:
+        """Numbers (from 0) of the pairs of coupled joints that are among these."""
+        return tuple(
+            (joint_names.index(a), joint_names.index(b))
+            for a, b in self.coupled
+            if a in joint_names and b in joint_names
+        )
 
     @property
     def punctual(self) -> SignalSettings:

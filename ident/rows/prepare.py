@@ -122,7 +122,8 @@ def prepare(
     springs = _stiffness(settings, session.joint_names) if sensed else None
     same = session.joint, settings.cutoff, settings.order, settings.outlier_scale, settings.longest_bridge_s
     wide = partial(recalled, effort_flags, times, settings, springs, recall, same)
-    motions = motions_shelved(filtered_motions(parts, wide, settings, blocks))
+    coupled = settings.coupled_places(session.joint_names)
+    motions = motions_shelved(filtered_motions(parts, wide, settings, coupled, blocks))
     release(position, effort)
     longest = max(parts, key=lambda part: part.count)
     excitation = recall.of(partial(excitation_hz, motions, longest, dt, settings.cutoff), *same)

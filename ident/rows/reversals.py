@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
@@ -31,6 +33,30 @@ def away_from_reversals(
     for joint, own in enumerate(speed.T):
         away[:, joint] &= ~ringing(own, dt)
     return away
+
+
+def away_of_drives(
+    speed: Floats,
+    dt: float,
+    window_s: float,
+    standstill_rad_s: float,
+    turning_rad: float,
+    *,
+    slow_rad_s: float = 0.0,
+    coupled: Sequence[tuple[int, int]] = (),
+) -> NDArray[np.bool_]:
+    """Samples (n, J) away from the reversals and the slow motion of their joint, and of the drives it shares.
+
+    Arguments as for `away_from_reversals`. slow_rad_s : speed up to which motion is slow. coupled : numbers of the two
+    joints of each pair; their shared drive turns with the sum of their speeds.
+    """
+    shared = np.column_stack([speed, *(speed[:, a] + speed[:, b] for a, b in coupled)])
+    away = away_from_reversals(shared, dt, window_s, standstill_rad_s, turning_rad)
+    away &= np.abs(shared) > slow_rad_s
+    found = away[:, : speed.shape[1]]
+    for pair, of_both in zip(coupled, away.T[speed.shape[1] :], strict=True):
+        found[:, list(pair)] &= of_both[:, None]
+    return found
 
 
 def ringing(speed: Floats, dt: float) -> NDArray[np.bool_]:

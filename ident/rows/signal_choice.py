@@ -277,6 +277,7 @@ class _Bench:
                             [self._smooth(rows.torque[:, j : j + 1], rows)[:, 0] for rows in some]
                         ),
                         np.concatenate([rows.speed[:, j] for rows in some]),
+                        np.concatenate([self._shared(rows.speed, j, settings) for rows in some]),
                         measured,
                         block,
                         tuple(some),
@@ -292,6 +293,12 @@ class _Bench:
                 "ones without losses, or import without the counter"
             )
         return found
+
+    def _shared(self, speed: Floats, joint: int, settings: SignalSettings) -> Floats:
+        """Speeds (m, k) of the drives that a joint shares with others, of the joints' (m, n)."""
+        pairs = settings.coupled_places(self.structure.chain.joint_names)
+        both = [speed[:, a] + speed[:, b] for a, b in pairs if joint in (a, b)]
+        return np.column_stack([speed[:, :0], *both])
 
     def _smooth(self, values: Floats, rows: BinnedRows) -> Floats:
         """Rows (m, k) with a low-pass common to torque and columns where an earlier one smoothed the torques."""
@@ -417,9 +424,7 @@ def _turning_rad(rows: ByClass, settings: SignalSettings, reasons: list[str]) ->
 def _slow_rad_s(rows: ByClass, settings: SignalSettings, reasons: list[str]) -> float:
     """Speed up to which slow motion is left out [rad/s]."""
     away = _away(rows, settings)
-    faster = [
-        {key: mask & (np.abs(rows[key].speed) > speed) for key, mask in away.items()} for speed in _SPEEDS
-    ]
+    faster = [{key: mask & rows[key].faster(speed) for key, mask in away.items()} for speed in _SPEEDS]
     place, chance = _first_alike(rows, faster, both=False)
     slow = _SPEEDS[place]
     reasons.append(
@@ -448,7 +453,7 @@ def _away(rows: ByClass, settings: SignalSettings) -> Masks:
     bins = round(settings.reversal / BIN_S)
     beside = settings.standstill_rad_s, settings.turning
     away = {key: own.known(bins, *beside) for key, own in rows.items()}
-    return {key: mask & (np.abs(rows[key].speed) > settings.slow) for key, mask in away.items()}
+    return {key: mask & rows[key].faster(settings.slow) for key, mask in away.items()}
 
 
 def _many(masks: Masks, whole: Masks) -> bool:

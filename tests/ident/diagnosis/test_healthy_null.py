@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.diagnosis import bench, channel_delays
+from ident.diagnosis import bench, channel_delays, recording
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.channel_delays import common_delays
 from ident.diagnosis.commission import as_stated
@@ -28,6 +28,7 @@ from ident.dynamics.structure import Condition, ModelStructure
 from ident.effects import EFFECTS, Shape
 from ident.model import DynamicModel
 from ident.rows.delay import Delay
+from ident.rows.filters import SignalSettings
 
 
 def reference(model: DynamicModel, null: dict[tuple[str, int], float], sets: int) -> Reference:
@@ -356,3 +357,20 @@ def test_healthy_sets_can_say_nothing_of_a_cause() -> None:
     healthy = Healthy({first: 50.0, second: 300.0}, {first: {"v": 1.0}, second: {"v": 1.0}})
     others = healthy.without(["motor_torque_delay"])
     assert (others.limits, others.shown, others.sizes) == ({first: 50.0}, {first: {"v": 1.0}}, {})
+
+
+def test_what_any_healthy_set_asks_to_leave_out_is_left_out_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Presliding and slow friction are the drives', and not every motion shows them."""
+    chosen = {
+        "first": SignalSettings(
+            cutoff_hz=60.0, decimate_hz=5.0, reversal_s=0.2, turning_rad=1e-3, slow_rad_s=0.1
+        ),
+        "second": SignalSettings(
+            cutoff_hz=50.0, decimate_hz=4.0, reversal_s=0.1, turning_rad=2e-2, slow_rad_s=0.0
+        ),
+    }
+    monkeypatch.setattr(
+        recording, "settled", lambda settings, sessions, *_: replace(settings, signals=chosen[sessions[0]])
+    )
+    found = recording.settled_for_all(DiagnosisSettings(), [["first"], ["second"]], None)  # type: ignore[list-item, arg-type]
+    assert found.signals == replace(chosen["first"], turning_rad=2e-2)

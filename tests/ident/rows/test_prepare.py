@@ -302,8 +302,8 @@ def test_an_earlier_filter_over_the_widest_window_leaves_the_reversals_in() -> N
     speed = np.sin(0.2 * np.arange(count))
     rows = {
         ("joint", 0): ClassRows(
-            speed[:, None], 2.0 * speed, speed, np.ones(count, dtype=bool), np.arange(count) // 50, (),
-            (slice(0, count),), np.arange(1), 1,
+            speed[:, None], 2.0 * speed, speed, np.ones((count, 0)), np.ones(count, dtype=bool),
+            np.arange(count) // 50, (), (slice(0, count),), np.arange(1), 1,
         )
     }  # fmt: skip
     for band, nothing in ((9.9, True), (10.1, False)):

@@ -213,7 +213,10 @@ def made(torque, matrix, even) -> ClassRows:
     whole = np.ones(count, dtype=bool)
     block = np.where(even, 0, 1)
     every = np.arange(matrix.shape[1])
-    return ClassRows(matrix, torque, np.ones(count), whole, block, (), (slice(0, count),), every, len(every))
+    none = np.ones((count, 0))
+    return ClassRows(
+        matrix, torque, np.ones(count), none, whole, block, (), (slice(0, count),), every, len(every)
+    )
 
 
 def test_a_loud_class_has_little_weight_in_the_fit():

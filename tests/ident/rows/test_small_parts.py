@@ -30,7 +30,7 @@ from ident.rows.filters import (
 )
 from ident.rows.observation import commanded, observe, stack
 from ident.rows.prepare import prepare
-from ident.rows.reversals import RINGING_S, away_from_reversals, turning_reach
+from ident.rows.reversals import RINGING_S, away_from_reversals, away_of_drives, turning_reach
 from ident.rows.sessions import payload_name, require, stated_mass
 from ident.rows.timebase import flag_outliers, sample_period, stretches
 from lwr_driver.session import Phase, Session
@@ -58,6 +58,32 @@ def test_a_slow_joint_has_to_go_on_for_the_path_on_which_friction_turns():
     assert away_from_reversals(speed, 0.01, 0.0, 0.002, 0.0)[10:].all()
     assert turning_reach(0.02, 0.002, 1e-3) == pytest.approx(0.52)
     assert turning_reach(0.0, 0.002, 0.0) == RINGING_S
+
+
+def test_two_joints_are_left_out_where_the_drive_that_they_share_turns():
+    speed = np.column_stack([np.full(60, 1.0), np.linspace(-2.0, -0.5, 60), np.full(60, 0.4)])
+    both = away_from_reversals((speed[:, 0] + speed[:, 1])[:, None], 0.01, 0.03, 0.002, 1e-3)[:, 0]
+    assert 0 < np.sum(~both) < 20
+    away = away_of_drives(speed, 0.01, 0.03, 0.002, 1e-3, coupled=[(0, 1)])
+    np.testing.assert_array_equal(away[3:-3, :2], np.column_stack([both, both])[3:-3])
+    assert away[3:-3, 2].all()
+    # Nor where it is slow; a joint alone is judged by its own speed.
+    slow = away_of_drives(speed, 0.01, 0.0, 0.002, 0.0, slow_rad_s=0.45, coupled=[(0, 1)])
+    np.testing.assert_array_equal(slow[:, 0], np.abs(speed[:, 0] + speed[:, 1]) > 0.45)
+    assert not slow[:, 2].any()
+    assert away_of_drives(speed, 0.01, 0.0, 0.002, 0.0, slow_rad_s=0.45)[:, 0].all()
+
+
+def test_rows_of_coupled_joints_are_left_out_beside_a_reversal_of_their_sum():
+    session = arm.session()
+    plain = prepare(session)
+    names = session.joint_names
+    pair = prepare(session, SignalSettings(coupled=((names[0], names[1]),)))
+    for one, other in zip(plain.passages, pair.passages, strict=True):
+        fewer = one.joint.known.sum(axis=0) - other.joint.known.sum(axis=0)
+        assert min(fewer[:2]) > 0
+        assert not fewer[2:].any()
+    assert SignalSettings(coupled=(("a", "b"), ("b", "z"))).coupled_places(["b", "a"]) == ((1, 0),)
 
 
 def test_a_link_that_rings_after_a_move_tells_nothing_of_its_drive():
