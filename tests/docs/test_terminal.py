@@ -404,7 +404,7 @@ def test_every_key_of_the_settings_reaches_the_identification(tmp_path: Path) ->
 
 def read_back(value: Any) -> Any:
     return (
-        tuple(value)
+        tuple(map(read_back, value))
         if isinstance(value, list)
         else ({key: read_back(item) for key, item in value.items()} if isinstance(value, dict) else value)
     )
