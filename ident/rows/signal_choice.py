@@ -69,6 +69,8 @@ _TOLERANCE = 0.005
 _WINDOWS = (0, 1, 2, 3, 4, 5, 7, 10)
 # Paths left out after a reversal [rad].
 _PATHS = (2e-3, 5e-3, 1e-2, 2e-2, 5e-2)
+# Path beyond which the friction of most drives has turned [rad].
+_FAR_RAD = 2e-2
 # Speeds up to which slow motion is left out [rad/s].
 _SPEEDS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 _WIDTHS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
@@ -144,8 +146,7 @@ def _chosen(
     rate = min(1.0 / session.joint.period_s for session in parts)
     reasons: list[str] = []
     found, band = _with_decimation(settings, parts, rate, motor, reasons, recall)
-    rough = [prepare(session, found, motor=motor, log=False, recall=recall) for session in parts]
-    delays = [0.0 if one.delay is None else one.delay.seconds for one in rough]
+    delays = [_delay_s(session, found, motor, recall) for session in parts]
     block_s = min(_BLOCK_S, min(session.duration_s for session in parts) / _LEAST_BLOCKS)
     bench = _Bench(parts, payloads, structure, columns, motor, delays, band, block_s, recall)
     rows: ByClass | None = None
@@ -163,6 +164,30 @@ def _chosen(
         found = replace(found, slow_rad_s=_slow_rad_s(rows, found, reasons))
     law, row_law = (coulomb, row_coulomb or coulomb) if coulomb else bench.laws(rows, found, reasons)
     return SignalChoice(found, law, row_law, tuple(reasons))
+
+
+def _delay_s(session: Session, settings: SignalSettings, motor: bool, recall: Recall) -> float:
+    """Delay of the motor torques [s], before what is left out beside reversals is chosen.
+
+    As far from reversals as may be chosen, for friction that turns over milliradians looks late by tens of
+    milliseconds; nearer to them where that leaves too little. 0 where neither tells it.
+    """
+    if not motor or session.motor is None:
+        return 0.0
+    far = replace(
+        settings,
+        reversal_s=_WINDOWS[-1] * BIN_S if settings.reversal_s is None else settings.reversal_s,
+        turning_rad=_FAR_RAD if settings.turning_rad is None else settings.turning_rad,
+    )
+    for beside in (far, settings):
+        try:
+            delay = prepare(session, beside, log=False, recall=recall).delay
+        except DataError as error:
+            logger.info("%s: no delay of the motor torques told yet: %s", session.path.name, error)
+            continue
+        if delay is not None and (delay.by_joint or delay.seconds):
+            return delay.seconds
+    return 0.0
 
 
 def _excerpt(session: Session, longest_s: float) -> Session:

@@ -12,8 +12,11 @@ from fri.errors import DataError
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.structure import Coulomb, ModelStructure
 from ident.rows.class_rows import ClassRows, blocks, error, fit
+from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
-from ident.rows.signal_choice import SignalChoice, choose_signals
+from ident.rows.prepare import prepare
+from ident.rows.signal_choice import SignalChoice, _delay_s, choose_signals
+from lwr_driver.session import Session
 from tests.ident import estimation_arm as arm
 
 
@@ -176,20 +179,42 @@ def test_slow_motion_with_more_friction_is_left_out(
     assert any(reason.startswith("slow motion: ") for reason in found.reasons)
 
 
-def test_a_path_of_presliding_is_left_out():
-    session = arm.session(motor=False, sensors=sensors(), period_s=20.0, periods=4)
+def turning(session: Session, symbol: str, path_rad: float) -> np.ndarray:
+    """What the friction `symbol` of the joints lacks while it turns over a path after a reversal."""
     time = session.joint.publish_time * 1e-9 - 3.0
     q, speed = arm.fourier(time, 20.0, 5)[:2]
     turned = np.vstack([np.ones((1, q.shape[1]), dtype=bool), np.diff(np.sign(speed), axis=0) != 0.0])
     gone = np.cumsum(np.abs(np.diff(q, axis=0, prepend=q[:1])), axis=0)
     since = gone - np.maximum.accumulate(np.where(turned, gone, 0.0), axis=0)
-    less = -2.0 * arm.drive("Fcl") * np.sign(speed) * np.exp(-since / 2e-3)
+    return np.asarray(-2.0 * arm.drive(symbol) * np.sign(speed) * np.exp(-since / path_rad))
+
+
+def test_a_path_of_presliding_is_left_out():
+    session = arm.session(motor=False, sensors=sensors(), period_s=20.0, periods=4)
+    less = turning(session, "Fcl", 2e-3)
     presliding = dataclasses.replace(
         session, joint=dataclasses.replace(session.joint, effort=session.joint.effort + less)
     )
     beside = SignalSettings(reversal_s=0.02)
     assert 5e-3 <= chosen(presliding, beside, Coulomb()).settings.turning_rad <= 1e-2
     assert chosen(session, beside, Coulomb()).settings.turning_rad == 1e-3
+
+
+def test_friction_that_turns_over_milliradians_is_no_late_motor_channel():
+    """Beside reversals it looks late by more than is searched, and sound sessions were refused."""
+    session = arm.session(sensors=sensors(), period_s=20.0, periods=2)
+    motor = session.motor
+    assert motor is not None
+    less = turning(session, "Fcm", 1e-2)[: len(motor)]
+    presliding = dataclasses.replace(session, motor=dataclasses.replace(motor, effort=motor.effort + less))
+    near = SignalSettings(decimate_hz=2.0, cutoff_hz=25.0)
+    with pytest.raises(DataError, match="at the edge of the searched delays"):
+        prepare(presliding, near, log=False)
+    assert abs(_delay_s(presliding, near, True, Recall())) < 0.002
+    # Where nothing is left so far from reversals, nearer rows tell it; without motor torques there is none.
+    quick = arm.session(sensors=dataclasses.replace(sensors(), motor_delay_s=0.008), period_s=1.0, periods=4)
+    assert _delay_s(quick, near, True, Recall()) == pytest.approx(0.008, abs=0.001)
+    assert _delay_s(presliding, near, False, Recall()) == 0.0
 
 
 def test_blocks_are_even_in_every_stretch():
