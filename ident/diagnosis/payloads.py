@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -105,7 +106,8 @@ def unstated_body(bench: DiagnosisBench, reference: Reference) -> UnstatedBody |
     """The body by which the base parameters of these sessions alone differ from the healthy arm's, None without one.
 
     The base parameters take all of it up, so no row shows it. It must be beyond chance beside every other cause that
-    would turn the same parameters, in proportion to what these sessions make of it.
+    would turn the same parameters, in proportion to what these sessions make of it. Where a cause explains more of the
+    differences than the body, its values are those beside that cause. What neither explains widens their deviations.
     """
     evidence, base = bench.evidence, bench.nominal.base
     # The limit itself accounts for the few days behind the variances.
@@ -124,21 +126,45 @@ def unstated_body(bench: DiagnosisBench, reference: Reference) -> UnstatedBody |
     body, off = white @ last_body(base)[tied], white @ (values - healthy)[tied]
     freedom = bench.nominal.arm.chain.n * max(reference.sets, 1)
     least = _TOLD * fisher_limit(_ONE_IN, _TOLD, freedom)
-    found, uncertain = _solved(body, off)
-    square = _square(found, uncertain)
-    # First moments alone are as well those of an error of sensors or positions.
-    if square <= least or abs(found[0]) < max(_BODY, _CLEAR * float(np.sqrt(uncertain[0, 0]))):
+    if not _clear(*_solved(body, off), least):
         return None
-    for candidate in bench.dictionary.candidates:
-        if candidate.effect is PAYLOAD_ERROR:
-            continue
-        for products in bench.dictionary.products(candidate):
-            turned = white @ (inverse @ products.alone.sum(axis=0).T)[tied]
-            if _square(*_solved(body, off, turned)) <= least:
-                return None
+    others = [
+        white @ (inverse @ products.alone.sum(axis=0).T)[tied]
+        for candidate in bench.dictionary.candidates
+        if candidate.effect is not PAYLOAD_ERROR
+        for products in bench.dictionary.products(candidate)
+    ]
+    strongest = max(others, key=partial(_explained, off), default=None)
+    if strongest is not None and _explained(off, strongest) <= _explained(off, body):
+        strongest = None
+    both = body if strongest is None else np.hstack([body, strongest])
+    left = float(off @ off) - _explained(off, both)
+    # Days differ by more than the variances of few of them say.
+    wider = max(left / max(len(off) - both.shape[1], 1), 1.0)
+    found, uncertain = _solved(body, off, strongest)
+    uncertain = wider * uncertain
+    if not _clear(found, uncertain, least):
+        return None
+    for turned in others:
+        values, covariance = _solved(body, off, turned)
+        if _square(values, wider * covariance) <= least:
+            return None
     change = last_body(base) @ found
     fall = float(change @ np.linalg.solve(inverse, change))
-    return UnstatedBody(found, uncertain, square, least, fall)
+    return UnstatedBody(found, uncertain, _square(found, uncertain), least, fall)
+
+
+def _clear(values: Floats, covariance: Floats, least: float) -> bool:
+    """Whether a body is beyond chance, and its mass told from zero: first moments alone are as well those of an error
+    of sensors or positions."""
+    told_from_zero = abs(values[0]) >= max(_BODY, _CLEAR * float(np.sqrt(covariance[0, 0])))
+    return told_from_zero and _square(values, covariance) > least
+
+
+def _explained(off: Floats, columns: Floats) -> float:
+    """Fall of the square of differences (p,) of unit variance by columns (p, k)."""
+    directions, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return float(np.sum(np.square(directions[:, sizes > _LEAST * sizes[0]].T @ off)))
 
 
 def _solved(body: Floats, off: Floats, beside: Floats | None = None) -> tuple[Floats, Floats]:

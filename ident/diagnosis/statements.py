@@ -33,6 +33,8 @@ from lwr_driver.listing import Listing, Piece, text_of
 _MOST_ROWS = {"unexplained": 4, "absorbed": 5}
 _REPR_LINES = 10
 _AVOIDABLE_LOOK = 0.3
+# Share of power above the healthy error where the error is twice that.
+_TWICE = 0.75
 _WORSE_REPLAY = 1.1
 REPLAYED = (
     ("position", "position", "mrad", 1e3),
@@ -292,9 +294,9 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
         on = "change with the time and not with the motion" if of_time else "depend on the motion"
         return "look", f"The data support no cause, but the residuals {on}"
     rows = details.get("rows", [])
-    if max((row["avoidable_share"] for row in rows), default=0.0) < _AVOIDABLE_LOOK:
+    beyond = max(map(_beyond_healthy, rows), default=0.0)
+    if max((row["avoidable_share"] for row in rows), default=0.0) < _AVOIDABLE_LOOK > beyond:
         return "good", "No model error is detectable in these data"
-    beyond = max(map(_beyond_healthy, rows))
     if beyond < _AVOIDABLE_LOOK:
         return "good", "No cause found, and no more error on held-out data than on the healthy days"
     than = "that of the healthy days" if any(row.get("healthy") for row in rows) else "the noise"
@@ -305,9 +307,15 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
 
 
 def _beyond_healthy(row: Plain) -> float:
-    """Share of power of the base model's error above the noise, and above its error on the healthy arm."""
+    """Share of power of the base model's error above the noise, and above its error on the healthy arm.
+
+    Without a repeated motion all of an error may pass for noise; twice that of the healthy arm is none.
+    """
     share, healthy = float(row["avoidable_share"]), row.get("healthy")
-    return min(share, 1.0 - (healthy / row["test_rms_base"]) ** 2) if healthy and share > 0.0 else share
+    if not healthy or row["test_rms_base"] <= 0.0:
+        return share
+    above = 1.0 - float(healthy / row["test_rms_base"]) ** 2
+    return above if above > _TWICE else min(share, above)
 
 
 def _lines(

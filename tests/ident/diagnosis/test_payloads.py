@@ -144,3 +144,24 @@ def test_no_body_is_told_that_another_cause_or_chance_explains(base: BaseSet) ->
     other = np.zeros(len(base))
     other[0] = 1.0
     assert unstated_body(carried(base, arm, BODY, (other,)), arm) is not None
+
+
+def test_no_body_is_told_of_differences_that_another_cause_explains_better(base: BaseSet) -> None:
+    """A tilt turns the same parameters and others; what is left of it beside a body is no chance, but much."""
+    arm = healthy(base, 2.0, 0.02)
+    turned = last_body(base) @ BODY + np.random.default_rng(2).normal(size=len(base))
+
+    def told(body: Any, also: Any, causes: tuple[Any, ...] = ()) -> Any:
+        found = carried(base, arm, body, causes)
+        values, covariance = found.evidence.free()
+        found.evidence.free = lambda: (values + also, covariance)
+        return unstated_body(found, arm)
+
+    assert told(0.0 * BODY, turned, (turned,)) is None
+    beside = told(3.0 * BODY, turned, (turned,))
+    assert beside is not None
+    assert beside.values[0] == pytest.approx(1.2, abs=0.05)
+    # Differences that nothing explains widen the deviations of a body.
+    alone, noisy = told(3.0 * BODY, 0.0), told(3.0 * BODY, 0.02 * turned)
+    assert noisy.covariance[0, 0] > 2.0 * alone.covariance[0, 0]
+    assert noisy.square < alone.square

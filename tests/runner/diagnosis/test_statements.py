@@ -108,6 +108,8 @@ def test_a_compliance_is_told_as_an_increase(reference: bool, owner: str) -> Non
         (0.6, None, [], "look", "up to 60 % of the error's power on held-out data is above the noise"),
         (0.6, 0.19, [], "good", "No cause found, and no more error on held-out data than on the healthy days"),
         (0.6, 0.14, [], "look", "up to 51 % of the error's power on held-out data is above that of the healthy days"),
+        (0.1, 0.12, [], "good", "No model error is detectable in these data"),
+        (0.1, 0.05, [], "look", "up to 94 % of the error's power on held-out data is above that of the healthy days"),
         (0.1, None, ["q3"], "look", "The data support no cause, but the residuals depend on the motion"),
         (0.1, None, ["q3", "time"], "look", "The data support no cause, but the residuals depend on the motion"),
         (0.1, None, ["time"], "look", "The data support no cause, but the residuals change with the time and not"),
