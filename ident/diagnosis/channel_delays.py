@@ -13,7 +13,7 @@ from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.reference import DELAY_STD_S, USUAL_DAYS, Reference
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.estimation.identify import IdentificationSettings, Known, observed
-from ident.estimators.estimate import fisher_tail
+from ident.estimators.estimate import chi_square_tail, fisher_tail
 from ident.rows.delay import Delay, weighted_mean
 from lwr_driver.session import Session
 
@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 CHANNELS = ("motor", "joint")
 ONE_IN = 0.0027
 """Largest probability of a late channel's delay on a healthy arm: three normal standard deviations."""
+# Chance below which sessions scatter by more than their deviations.
+_SCATTERED = 0.01
 
 
 def channel_delays(
@@ -74,18 +76,24 @@ def sides_apart(
     """Channels whose delay is not that of the healthy arm, with the difference and its standard deviation [s].
 
     In all rows friction that turns over another length looks late as well, so a gain there has to be more than on
-    healthy days; these rows tell the two apart. The probability is that of Student's distribution, since the healthy
-    delays' standard deviation comes from few days.
+    healthy days; these rows tell the two apart. The scatter of the sessions widens the deviation of their mean where it
+    is more than theirs by chance: one that hardly tells a delay says nothing against one that does. The probability is
+    that of Student's distribution, with the freedom of both deviations together (Welch and Satterthwaite), since that
+    of the healthy delays comes from few days.
     """
     found = {}
     for side, told in channel_delays(sessions, arm, settings).items():
         if not told:
             continue
         mean, std, chi = mean_of(told)
+        if chi_square_tail(chi**2 * (len(told) - 1), max(len(told) - 1, 1)) < _SCATTERED:
+            std *= chi
         apart = mean - (arm.motor_delay_s if side == "motor" else arm.joint_delay_s)
-        variance = (chi * std) ** 2 + reference.delay_std_s.get(side, DELAY_STD_S) ** 2
-        if fisher_tail(apart**2 / variance, 1, USUAL_DAYS + max(reference.sets, 1) - 1) < ONE_IN:
-            found[side] = apart, chi * std
+        days = reference.delay_std_s.get(side, DELAY_STD_S) ** 2
+        variance = std**2 + days
+        freedom = (USUAL_DAYS + max(reference.sets, 1) - 1) * (variance / days) ** 2
+        if fisher_tail(apart**2 / variance, 1, freedom) < ONE_IN:
+            found[side] = apart, std
     return found
 
 

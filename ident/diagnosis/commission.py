@@ -116,11 +116,12 @@ def commission(
     start = replace(nominal_arm(chain, arm, None), encoder_known=True)
     sides: tuple[Side, ...] = ("link", "motor") if np.any(start.compliance > 0.0) else ("link",)
     couplings = () if arm is None else arm.couplings
+    stated = settings.signals
     settings = settled_for_all(settings, parts[:_TUNING_SETS], chain, couplings)
     recorded: list[list[SessionRecord]] = []
     for part in parts:
         recall = Recall()
-        broken = broken_channels(part, chain, settings.signals, couplings, recall=recall)
+        broken = broken_channels(part, chain, stated, couplings, recall=recall)
         refuse([one for one in broken if not one.lost], chain.joint_names)
         records = [record(s, k, chain, settings, recall=recall) for k, s in enumerate(part)]
         recorded.append(list(without_broken(records, broken)))

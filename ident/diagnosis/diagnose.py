@@ -89,13 +89,14 @@ def diagnose(
         raise DataError("no session given; name at least one session file")
     everything = sorted([*sessions, *test], key=lambda s: s.start)
     held = {id(s) for s in test}
+    couplings, recall = () if arm is None else arm.couplings, Recall()
+    # As `identify` does, whatever a reference filters with.
+    broken = broken_channels(everything, chain, settings.signals, couplings, recall=recall)
     known = None if reference is None else signal_settings(reference.model)
     if known is not None:
         # Of the reference's sessions, not of these.
         known = replace(known, motor_delay_s="estimate", joint_delay_s="estimate")
         settings = replace(settings, signals=known)
-    couplings, recall = () if arm is None else arm.couplings, Recall()
-    broken = broken_channels(everything, chain, settings.signals, couplings, recall=recall)
     with blamed(broken, chain.joint_names):
         settings = settled(settings, sessions, chain, couplings, recall=recall)
         recordings = tuple(
