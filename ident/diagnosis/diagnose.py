@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from fri.errors import DataError
+from ident.diagnosis.against_healthy import against_healthy
 from ident.diagnosis.bench import (
     ArmData,
     DiagnosisBench,
@@ -111,7 +112,15 @@ def diagnose(
         )
         if worthless(broken):
             return _ended(task, broken)
-        task, first = _begun(task)
+        whole = task
+        task, first = _begun(whole)
+        contradicted = _contradicted(first.bench, reference)
+        if contradicted:
+            broken = (*broken, *contradicted)
+            whole = replace(whole, recordings=without_broken(recordings, contradicted), sound=False)
+            if worthless(broken):
+                return _ended(whole, broken)
+            task, first = _begun(whole)
         others = other_masses(first.bench, reference)
         body = None if reference is None else unstated_body(first.bench, reference)
         if reference is not None and (others or body is not None):
@@ -136,6 +145,14 @@ def _ended(task: Task, broken: Sequence[BrokenChannel]) -> Diagnosis:
     task = replace(task, simulate=None)
     state = State(task.bench(task.arm, task.reference, fit_compliance=False), Selection([], {}, {}))
     return replace(conclude(task, state), findings=(), unexplained=(), data=tuple(broken))
+
+
+def _contradicted(bench: DiagnosisBench, reference: Reference | None) -> tuple[BrokenChannel, ...]:
+    """The torque channels that the healthy arm contradicts; none without one."""
+    healthy = None if reference is None else reference.prior(bench.nominal.base, bench.nominal.masses)
+    if healthy is None:
+        return ()
+    return against_healthy(bench.nominal.rows, healthy[1], bench.nominal.arm.chain.joint_names)
 
 
 def _bench(task: Task) -> DiagnosisBench:
