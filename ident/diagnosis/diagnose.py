@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -130,6 +130,7 @@ def diagnose(
                 task = replace(task, reference=reference.carrying(body.values, body.covariance))
             first = _first(task, _bench(task))
         state = _refined(task, _in_time(task, first))
+        state = replace(state, notes=(*state.notes, *late_by_themselves(task.apart, state)))
         if reference is not None:
             loads = [payload_finding(one) for one in (*others, body) if one is not None]
             state = replace(state, loads=tuple(loads))
@@ -349,6 +350,23 @@ def _own_delay(claim: Claim, limit: float) -> str:
         f"delay is unknown without a reference, so a delay below {1e3 * limit:.0f} ms (one sample of each channel) is "
         "not reported as a finding"
     )
+
+
+def late_by_themselves(apart: Mapping[str, tuple[float, float]], state: State) -> list[str]:
+    """Channels that rows away from reversals alone tell late, or early: the other rows have a finding or a note of the
+    others.
+
+    apart : as of `sides_apart`.
+    """
+    known: set[str | None] = {EFFECTS[finding.cause].channel for finding in state.timing}
+    known |= {side for side in apart for note in state.notes if note.startswith(f"{side} torques")}
+    return [
+        f"{side} torques look {1e3 * abs(delay):.1f} ± {1e3 * std:.1f} ms {'late' if delay > 0 else 'early'} against "
+        "the healthy arm in rows away from reversals; with reversals no row shows it, so it is no finding. A fast "
+        "motion with few reversals tells"
+        for side, (delay, std) in apart.items()
+        if side not in known
+    ]
 
 
 def _told_apart(task: Task, claim: Claim) -> tuple[float, float] | None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
 from fri.errors import ConfigurationError
-from fri.quantities import within
+from fri.quantities import Name, within
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Coupling
 from ident.rows.butterworth import forward_and_back, sections, spectrum
@@ -85,7 +85,7 @@ class SignalSettings:
     joint_delay_s: DelaySetting = "estimate"
     delay_search_s: Annotated[float, within(0.0, 10.0, "s", above=True)] = 0.1
     stiffness_nm_rad: tuple[Annotated[float, within(0.0, 1e12, "Nm/rad", above=True)], ...] | None = None
-    coupled: tuple[tuple[str, str], ...] = ()
+    coupled: tuple[tuple[Name, Name], ...] = ()
 
     def __post_init__(self) -> None:
         positive = (

@@ -13,6 +13,7 @@ from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.channel_delays import common_delays
 from ident.diagnosis.commission import as_stated
 from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std
+from ident.diagnosis.diagnose import late_by_themselves
 from ident.diagnosis.healthy_null import HealthyNull
 from ident.diagnosis.nominal_arm import GAIN_STD, NominalArm
 from ident.diagnosis.presliding import with_far_presliding
@@ -350,6 +351,27 @@ def test_a_delay_apart_from_the_healthy_one_is_told_by_rows_away_from_reversals(
     assert set(found) == ({"motor"} if apart else set())
     if apart:
         assert found["motor"][0] == pytest.approx(3.05e-3, abs=1e-4)
+
+
+def test_a_session_that_hardly_tells_a_delay_does_not_contradict_one_that_does(
+    arm: NominalArm, model: DynamicModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    delays = [told(-1e-3, 3e-3), told(5.4e-3, 7e-4)]
+    monkeypatch.setattr(channel_delays, "channel_delays", lambda *_: {"motor": delays})
+    known = replace(reference(model, {}, 2), delay_std_s={"motor": 5e-4})
+    found = channel_delays.sides_apart([], replace(arm, motor_delay_s=0.0), DiagnosisSettings(), known)
+    assert found["motor"] == pytest.approx((5.1e-3, 6.8e-4), abs=1e-4)
+
+
+def test_a_channel_late_away_from_reversals_alone_is_a_note() -> None:
+    apart = {"motor": (4.8e-3, 7e-4), "joint": (-2e-3, 3e-4)}
+    state = SimpleNamespace(timing=(), notes=())
+    late, early = late_by_themselves(apart, state)  # type: ignore[arg-type]
+    assert late.startswith("motor torques look 4.8 ± 0.7 ms late against the healthy arm")
+    assert early.startswith("joint torques look 2.0 ± 0.3 ms early")
+    # A finding of the channel, or a note of it, has said so.
+    state.timing, state.notes = (SimpleNamespace(cause="motor_torque_delay"),), ("joint torques look late",)
+    assert late_by_themselves(apart, state) == []  # type: ignore[arg-type]
 
 
 def test_healthy_sets_can_say_nothing_of_a_cause() -> None:
