@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 from scipy.signal import correlate
 
+from ident.diagnosis.bench import again_with
+from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.noise import _misfit
+from ident.diagnosis.selection import Claim, Selection
+from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.signatures import signature_bench
 from ident.dynamics.kinematics import Chain
+from ident.effects import EFFECTS, Shape
 from ident.estimators.covariance import correlation_time
 from lwr_driver.session import Session
 
@@ -32,3 +37,22 @@ def test_noise_of_a_residual_follows_its_autocorrelation(make: Make, chain: Chai
     assert sigma[0] == pytest.approx(np.sqrt(np.nanmean(residual[~rows.test, 0] ** 2)))
     assert inflation[0] == pytest.approx(correlation_time(total))
     assert 4.0 < inflation[0] < 8.0
+
+
+def test_what_a_coarse_law_leaves_of_a_fault_is_no_noise(make: Make, chain: Chain) -> None:
+    """A drift told as a step leaves five times the healthy noise in its rows, and would no longer be seen in it."""
+    bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
+    side, joint = "joint", 1
+    column = np.sin(np.arange(len(bench.nominal.rows[side].time)))[:, None]
+    rows = {(side, joint): column}
+    score = bench.evidence.score(bench.evidence.padded(rows))
+    trial = Trial(Candidate(EFFECTS["sensor_ripple"], joint), Shape(), score, rows)
+    selection = Selection([Claim(trial, score)], {}, {})
+    after = again_with(bench, selection, DiagnosisSettings(), None)
+    assert after is not None
+    left = after.evidence.sigma[side][joint]
+    for noise, kept in ((0.2 * left, 0.4 * left), (0.8 * left, left), (3.0 * left, left)):
+        bench.evidence.sigma[side][joint] = noise
+        again = again_with(bench, selection, DiagnosisSettings(), None)
+        assert again is not None
+        assert again.evidence.sigma[side][joint] == pytest.approx(kept, rel=0.05)
