@@ -30,6 +30,7 @@ from ident.diagnosis.products import (
     inverse_of,
     left_beside,
     schur,
+    width_of,
 )
 from ident.diagnosis.score import Score, widened
 from ident.diagnosis.settings import DiagnosisSettings
@@ -166,8 +167,8 @@ class Evidence:
         """The further columns with their places behind the base."""
         place = self.base_count
         for rows in self.extra:
-            yield slice(place, place + _width(rows)), rows
-            place += _width(rows)
+            yield slice(place, place + width_of(rows)), rows
+            place += width_of(rows)
 
     def coefficients(self) -> list[Floats]:
         """Values (k,) of each group of further columns in the full fit."""
@@ -176,7 +177,7 @@ class Evidence:
     def _gram(self) -> None:
         """Products of base and further columns, and the fits with and without each part of the motion."""
         p = self.base_count
-        size = p + sum(_width(rows) for rows in self.extra)
+        size = p + sum(width_of(rows) for rows in self.extra)
         self.gram, self.target = np.zeros((self.blocks, size, size)), np.zeros((self.blocks, size))
         self.gram[:, :p, :p], self.target[:, :p] = self._base_gram, self._base_target
         for here, rows in self._places():
@@ -239,8 +240,8 @@ class Evidence:
         if missing:
             sums, place = block_sums(self.parts, self._cross(_made(columns), self._together(missing))), 0
             for rows in missing:
-                known.crossed[id(rows)] = sums[:, :, place : place + _width(rows)]
-                place += _width(rows)
+                known.crossed[id(rows)] = sums[:, :, place : place + width_of(rows)]
+                place += width_of(rows)
         further = partial(self._further, columns, list(self.extra))
         sums = np.concatenate([known.crossed[id(rows)] for rows in self.extra], axis=2)
         return replace(known, further=further, further_sums=sums)
@@ -253,12 +254,12 @@ class Evidence:
         """Groups of further columns side by side, padded, by key."""
         names = tuple(map(id, groups))
         if names not in self._joined:
-            joined, size, place = dict[Key, Floats](), sum(map(_width, groups)), 0
+            joined, size, place = dict[Key, Floats](), sum(map(width_of, groups)), 0
             for rows in groups:
                 for key, values in self._known[id(rows)][1].items():
                     wide = joined.setdefault(key, np.zeros((len(values), size)))
-                    wide[:, place : place + _width(rows)] = values
-                place += _width(rows)
+                    wide[:, place : place + width_of(rows)] = values
+                place += width_of(rows)
             self._joined[names] = joined
         return self._joined[names]
 
@@ -277,7 +278,7 @@ class Evidence:
 
     def _cross(self, a: Mapping[Key, Floats], b: Mapping[Key, Floats]) -> Floats:
         """Products (blocks, k, l) of two groups of padded columns."""
-        k, width = (next(iter(a.values())).shape[1], next(iter(b.values())).shape[1]) if b else (0, 0)
+        k, width = (width_of(a), width_of(b)) if b else (0, 0)
         total, places = np.zeros((self.blocks, k, width)), np.arange(width)
         # In a fixed order: the last digits of a sum depend on it.
         for key in sorted(a.keys() & b.keys()):
@@ -286,7 +287,7 @@ class Evidence:
 
     def alone(self, columns: Mapping[Key, Floats]) -> Products:
         """Products of padded columns with the base, themselves and the torques."""
-        width = next(iter(columns.values())).shape[1]
+        width = width_of(columns)
         base = np.zeros((self.blocks, width, self.base_count))
         own = np.zeros((self.blocks, width, width))
         target = np.zeros((self.blocks, width, 1))
@@ -476,10 +477,6 @@ class Evidence:
         """Sum of squares of all fitted rows, in units of their noise."""
         v = self.full.values
         return float(self.energy.sum() - 2.0 * v @ self.target.sum(axis=0) + v @ self.gram.sum(axis=0) @ v)
-
-
-def _width(rows: Rows) -> int:
-    return next(iter(rows.values())).shape[1]
 
 
 def _made(columns: _Columns) -> Mapping[Key, Floats]:

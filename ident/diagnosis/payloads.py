@@ -163,8 +163,13 @@ def _clear(values: Floats, covariance: Floats, least: float) -> bool:
 
 def _explained(off: Floats, columns: Floats) -> float:
     """Fall of the square of differences (p,) of unit variance by columns (p, k)."""
+    return float(np.sum(np.square(_directions(columns).T @ off)))
+
+
+def _directions(columns: Floats) -> Floats:
+    """Orthonormal directions (p, r) of columns (p, k)."""
     directions, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    return float(np.sum(np.square(directions[:, sizes > _LEAST * sizes[0]].T @ off)))
+    return np.asarray(directions[:, sizes > _LEAST * sizes[0]])
 
 
 def _solved(body: Floats, off: Floats, beside: Floats | None = None) -> tuple[Floats, Floats]:
@@ -172,8 +177,7 @@ def _solved(body: Floats, off: Floats, beside: Floats | None = None) -> tuple[Fl
     `body` (p, 10); beside : further columns (p, k)."""
     if beside is not None:
         # What another cause explains is left out of both.
-        columns, sizes, _ = np.linalg.svd(beside, full_matrices=False)
-        other = columns[:, sizes > _LEAST * sizes[0]]
+        other = _directions(beside)
         body, off = body - other @ (other.T @ body), off - other @ (other.T @ off)
     covariance: Floats = np.asarray(np.linalg.inv(body.T @ body + np.diag(_USUAL**-2.0)), dtype=np.float64)
     return np.asarray(covariance @ (body.T @ off)), covariance

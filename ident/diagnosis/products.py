@@ -64,6 +64,11 @@ class Products:
         return Products(self.base * wide, self.own * wide, self.target * on[:, None], self.parts)
 
 
+def width_of(rows: Rows) -> int:
+    """Number of columns."""
+    return next(iter(rows.values())).shape[1]
+
+
 def inverse_of(gram: Floats, scale: Floats) -> Floats:
     """Inverse (P, P) of products scaled to a diagonal near one."""
     both = np.outer(scale, scale)

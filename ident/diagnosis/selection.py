@@ -18,7 +18,7 @@ from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.healthy_null import HealthyNull
 from ident.diagnosis.model_form import model_form_error
-from ident.diagnosis.products import Floats, Key, Rows
+from ident.diagnosis.products import Floats, Key, Rows, width_of
 from ident.diagnosis.rivals import confidence, exceeds, look_alikes
 from ident.diagnosis.score import Score
 from ident.diagnosis.settings import DiagnosisSettings
@@ -223,7 +223,7 @@ class State:
         taken = {t.candidate.key for t in accepted}
         entries = [one for one in self.tolerated() if one.of not in taken]
         fixed = [t.rows for t in accepted]
-        place = self.evidence.base_count + sum(_width(rows) for rows in fixed)
+        place = self.evidence.base_count + sum(width_of(rows) for rows in fixed)
         inside = entries
         while True:
             self.evidence.replace([*fixed, *(one.rows for one in inside)])
@@ -571,7 +571,3 @@ class State:
         """The candidate of the same torque in these sessions, by the physics of the effect."""
         cause = candidate.effect.same_as(self.dictionary.setting, candidate.joint)
         return next((c for c in self.dictionary.candidates if c.key == (cause, candidate.joint)), None)
-
-
-def _width(rows: Rows) -> int:
-    return next(iter(rows.values())).shape[1]

@@ -47,6 +47,11 @@ class ClassRows:
         return self.matrix @ values[self.acting]
 
     @property
+    def drives(self) -> Floats:
+        """Speeds (m, 1 + k) of the joint and of the drives that it shares."""
+        return np.column_stack([self.speed, self.shared])
+
+    @property
     def even(self) -> NDArray[np.bool_]:
         """Rows (m,) of the fitted blocks."""
         return np.asarray(self.block % 2 == 0)
@@ -54,8 +59,7 @@ class ClassRows:
     def known(self, bins: int, standstill_rad_s: float, turning_rad: float) -> NDArray[np.bool_]:
         """Measured rows (m,) more than `bins` rows and the path `turning_rad` from a reversal of the joint or of a
         drive that it shares."""
-        found = self.measured.copy()
-        speed = np.column_stack([self.speed, self.shared])
+        found, speed = self.measured.copy(), self.drives
         for some in self.stretches:
             away = away_from_reversals(speed[some], BIN_S, bins * BIN_S, standstill_rad_s, turning_rad)
             found[some] &= away.all(axis=1)
@@ -63,8 +67,7 @@ class ClassRows:
 
     def faster(self, speed_rad_s: float) -> NDArray[np.bool_]:
         """Rows (m,) in which the joint and each drive that it shares are faster than this."""
-        speed = np.column_stack([self.speed, self.shared])
-        return np.asarray((np.abs(speed) > speed_rad_s).all(axis=1))
+        return np.asarray((np.abs(self.drives) > speed_rad_s).all(axis=1))
 
 
 ByClass = dict[tuple[str, int], ClassRows]
