@@ -10,7 +10,7 @@ import numpy as np
 from fri.errors import DataError
 from ident.diagnosis.candidates import Dictionary, Trial
 from ident.diagnosis.evidence import Evidence
-from ident.diagnosis.noise import noise_floor, repeatability
+from ident.diagnosis.noise import beside_healthy, noise_floor, repeatability
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal, structure_of
 from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.products import Floats
@@ -167,9 +167,9 @@ def _evidence(
     prior: tuple[Floats, Floats] | None,
     healthy: Reference | None = None,
 ) -> tuple[Evidence, bool]:
-    """Evidence with the noise floor of a first fit, and no more noise than on the `healthy` arm. Without one the prior
-    keeps base parameters with weak excitation near the drawing; repeated periods make their uncertainty known, so it is
-    left out."""
+    """Evidence with the noise floor of a first fit, see `beside_healthy`. Without a healthy arm the prior keeps base
+    parameters with weak excitation near the drawing; repeated periods make their uncertainty known, so it is left out.
+    """
     compared = healthy is not None
     one = {side: np.ones(nominal.arm.chain.n) for side in nominal.rows}
     first = Evidence(nominal, settings, one, one)
@@ -177,12 +177,13 @@ def _evidence(
         # Gains of other days are no noise.
         first.replace(list(gain_rows(Dictionary(nominal, first, ())).values()))
     sigma, inflation, floor, repeatable = _noise(nominal, first.residuals())
-    if healthy is not None and not repeatable:
-        # A strong cause is no noise.
+    if healthy is not None:
         for side in sigma.keys() & healthy.correlated.keys():
-            quiet = healthy.noise[side] ** 2 * healthy.correlated[side] < sigma[side] ** 2 * inflation[side]
-            sigma[side] = np.where(quiet, healthy.noise[side], sigma[side])
-            inflation[side] = np.where(quiet, healthy.correlated[side], inflation[side])
+            sigma[side], inflation[side] = beside_healthy(
+                (sigma[side], inflation[side]),
+                (healthy.noise[side], healthy.correlated[side]),
+                repeatable=repeatable,
+            )
     if repeatable and not compared:
         prior = None
     return Evidence(nominal, settings, sigma, inflation, prior, compared=compared, floor=floor), repeatable

@@ -157,12 +157,16 @@ def commission(
         known = _later(known, open_s)
     known = replace(known, healthy=character(known, recorded, settings))
     days = [_day(known, recordings, settings, base) for recordings in recorded]
+    whole = _reference(days, known, robot, parts[0], {})
     null: dict[tuple[str, int], float] = {}
     shown: dict[tuple[str, int], dict[str, float]] = {}
     tables, left = [], []
     for number, recordings in enumerate(recorded):
         others = [day for k, day in enumerate(days) if k != number]
         rest = _reference(others, known, robot, parts[0], {}, days) if others else None
+        if rest is not None:
+            # All sets in the same noise, for their gains are compared.
+            rest = replace(rest, noise=whole.noise, correlated=whole.correlated)
         bench = prepare_bench(known, recordings, settings, rest, None, fit_compliance=False)
         own = gains(bench.dictionary, bench.evidence, settings)
         for key, gain in (own | remainder_gains(bench.dictionary, bench.evidence)).items():

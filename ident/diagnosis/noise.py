@@ -63,6 +63,19 @@ def noise_floor(
     return sigma, inflation, True
 
 
+def beside_healthy(
+    own: tuple[Floats, Floats], healthy: tuple[Floats, Floats], *, repeatable: bool
+) -> tuple[Floats, Floats]:
+    """Noise (n,) of a row [Nm] and its variance inflation (n,) in sessions held against a healthy arm's.
+
+    No more than the healthy noise, for a strong cause is no noise. Where periods repeat they show the noise of the
+    sensors alone, without what the healthy model lacks: then no less, for the gains of causes on the healthy arm were
+    counted in its noise.
+    """
+    take = (healthy[0] ** 2 * healthy[1] < own[0] ** 2 * own[1]) != repeatable
+    return np.where(take, healthy[0], own[0]), np.where(take, healthy[1], own[1])
+
+
 def repeatability(recordings: Sequence[SessionRecord], rows: SideRows, residual: Floats) -> Floats:
     """Noise (n,) of a row [Nm] from sessions with the same motion, NaN without any. Every difference from run to run
     counts, drifts as well."""

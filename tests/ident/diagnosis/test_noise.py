@@ -10,7 +10,7 @@ from scipy.signal import correlate
 
 from ident.diagnosis.bench import again_with
 from ident.diagnosis.candidates import Candidate, Trial
-from ident.diagnosis.noise import _misfit
+from ident.diagnosis.noise import _misfit, beside_healthy
 from ident.diagnosis.selection import Claim, Selection
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.signatures import signature_bench
@@ -37,6 +37,17 @@ def test_noise_of_a_residual_follows_its_autocorrelation(make: Make, chain: Chai
     assert sigma[0] == pytest.approx(np.sqrt(np.nanmean(residual[~rows.test, 0] ** 2)))
     assert inflation[0] == pytest.approx(correlation_time(total))
     assert 4.0 < inflation[0] < 8.0
+
+
+@pytest.mark.parametrize(("repeatable", "expected"), [(False, [0.02, 0.1]), (True, [0.1, 0.3])])
+def test_noise_beside_a_healthy_arm_is_counted_as_its_gains_were(
+    repeatable: bool, expected: list[float]
+) -> None:
+    """Ten rows count as one in the healthy noise of 0.1 Nm, and one in that of the periods."""
+    own = np.array([0.02, 0.3]), np.array([1.0, 10.0])
+    sigma, inflation = beside_healthy(own, (np.full(2, 0.1), np.full(2, 10.0)), repeatable=repeatable)
+    assert sigma.tolist() == expected
+    assert inflation.tolist() == [10.0 if value >= 0.1 else 1.0 for value in expected]
 
 
 def test_what_a_coarse_law_leaves_of_a_fault_is_no_noise(make: Make, chain: Chain) -> None:
