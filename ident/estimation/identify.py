@@ -202,9 +202,11 @@ class Identification(Tabular):
                     "rows": session.counts["rows"],
                     "lost_samples": session.counts["lost"],
                     "motor_delay_s": session.delay.seconds if session.delay is not None else None,
-                    "motor_delay_std_s": session.delay.std if session.delay is not None else None,
+                    "motor_delay_std_s": session.delay.std or None if session.delay is not None else None,
                     "joint_delay_s": session.joint_delay.seconds if session.joint_delay is not None else None,
-                    "joint_delay_std_s": session.joint_delay.std if session.joint_delay is not None else None,
+                    "joint_delay_std_s": session.joint_delay.std or None
+                    if session.joint_delay is not None
+                    else None,
                     "stamp_jitter_s": session.jitter_s,
                     "excitation_hz": session.excitation_hz,
                     "cutoff_hz": session.cutoff_hz,

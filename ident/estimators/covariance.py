@@ -42,6 +42,10 @@ _MANY_BLOCKS = 60
 _LAGS = 10
 # Degrees of freedom counted as known exactly.
 _MOST_FREEDOM = 1e4
+# Least blocks of a record: its parameters, such as those of its payload, are estimated without each of them.
+_LEAST_BLOCKS = 4
+# Least share of a parameter's information outside of a block, for an estimate without it.
+_ELSEWHERE = 1e-4
 # Least share of a parameter's variance by the rows; below, the prior alone knows it.
 _SHOWN = 1e-9
 
@@ -196,7 +200,7 @@ def jackknife(
             weighted = left[rows] * row_weights[number][rows, None]
             normals[key] = normals.get(key, np.zeros((p, p))) + weighted.T @ group.matrix[rows]
             sums[key] = sums.get(key, np.zeros(p)) + left[rows].T @ coefficients[number][rows]
-    shifts, without = [], np.zeros(p)
+    shifts, without, alone = [], np.zeros(p), np.zeros(p, dtype=bool)
     for key, normal in normals.items():
         rest = information - normal
         # Weak instruments can make a diagonal entry negative.
@@ -204,7 +208,11 @@ def jackknife(
         scaled = rest / np.outer(scale, scale)
         solved = np.linalg.lstsq(scaled, np.column_stack([sums[key] / scale, np.eye(p)]), rcond=1e-10)[0]
         shifts.append(solved[:, 0] / scale)
-        without += np.diag(solved[:, 1:]) / scale**2 - np.diag(bread)
+        variances = np.diag(solved[:, 1:]) / scale**2
+        alone |= (scale**2 < _ELSEWHERE * np.abs(np.diag(information))) | (
+            variances > np.diag(bread) / _ELSEWHERE
+        )
+        without += variances - np.diag(bread)
     count = len(shifts)
     stacked = np.array(shifts)
     matrix = (count - 1) / count * (stacked.T @ stacked)
@@ -224,6 +232,11 @@ def jackknife(
         how = ", moderated"
     if correlation is not None:
         own, other = np.sqrt(np.diag(matrix)), np.sqrt(np.maximum(np.diag(correlation), 0.0))
+        if alone.any():
+            # Without its only block a parameter is anything: its deviation is the HAC's, widened as those of others.
+            known = ~alone & (other > 0.0)
+            widened = float(np.median(own[known] / other[known])) if known.any() else 1.0
+            own = np.where(alone, max(widened, 1.0) * other, own)
         ratio = own / np.where(other > 0, other, 1.0)
         matrix = correlation * np.outer(ratio, ratio)
     kind = (
@@ -310,7 +323,7 @@ class _Blocks:
 
     @classmethod
     def of(cls, problem: Problem, block_s: float) -> _Blocks:
-        """At least eight blocks in all, at most eighty."""
+        """At least eight blocks in all, at most eighty, and some of each record."""
         spans: dict[int, tuple[int, int]] = {}
         periodic = False
         for record in {group.record for group in problem.groups}:
@@ -327,7 +340,7 @@ class _Blocks:
         length = max(1, round(block_s / problem.sample_time_s))
         length = int(np.clip(length, -(-total // 80), max(1, total // 8)))
         counts = {
-            record: (first, samples, max(1, round(samples / length)))
+            record: (first, samples, min(samples, max(_LEAST_BLOCKS, round(samples / length))))
             for record, (first, samples) in spans.items()
         }
         return cls(length, counts, periodic)

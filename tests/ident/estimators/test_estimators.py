@@ -238,6 +238,40 @@ def test_a_jackknife_is_as_wide_for_what_few_blocks_show_as_for_the_rest():
     assert seldom == pytest.approx(common, rel=0.1)
 
 
+def test_a_parameter_of_one_short_period_among_long_records_keeps_its_deviation():
+    """As a payload that one session carries: blocks as long as the period would leave nothing of it."""
+    ratios = []
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        long, short = np.zeros((600, 2)), np.zeros((120, 2))
+        long[:, 0] = random.normal(size=600)
+        short[:] = np.tile(random.normal(size=(30, 2)), (4, 1))
+        groups = tuple(
+            RowGroup("0", "joint", k, m, m @ [1.0, 1.0] + random.normal(size=len(m)), np.arange(len(m)))
+            for k, m in enumerate((long, short))
+        )
+        case = Problem(("a", "b"), groups, 0.2, periods=(None, 30))
+        found = WeightedLeastSquares(CovarianceSettings("jackknife", block_s=12.0)).fit(case)
+        ratios.append(found.std[1] / np.sqrt(found.covariances["textbook"].matrix[1, 1]))
+    assert 0.8 < np.median(ratios) < 1.6
+    assert 0.3 < min(ratios) < max(ratios) < 3.0
+
+
+def test_a_parameter_that_one_block_alone_shows_has_the_deviation_of_the_hac():
+    for seed in range(10):
+        random = np.random.default_rng(seed)
+        matrix = random.normal(size=(400, 3))
+        matrix[:, 2] = 0.0
+        matrix[105:115, 2] = random.normal(size=10)
+        group = RowGroup(
+            "0", "joint", 0, matrix, matrix @ np.ones(3) + random.normal(size=400), np.arange(400)
+        )
+        case = Problem(("a", "b", "c"), (group,), 0.2)
+        found = WeightedLeastSquares(CovarianceSettings("jackknife", block_s=4.0)).fit(case)
+        of_hac = np.sqrt(np.diag(found.covariances["hac"].matrix))
+        assert found.std[2] == pytest.approx(of_hac[2] * max(np.median(found.std[:2] / of_hac[:2]), 1.0))
+
+
 def test_periods_are_no_independent_witnesses_of_what_the_model_lacks():
     matrices = [np.tile(matrix, (4, 1)) for matrix in design(samples=150, seed=3)]
     inside, alone = [], []
