@@ -20,8 +20,8 @@ _HALF_DIGIT = 0.5 * 10.0 ** (1 - DIGITS)
 
 
 def rounded(values: Floats) -> Floats:
-    """The values with the digits of a file."""
-    flat = [float(f"{value:.{DIGITS}g}") for value in np.ravel(values)]
+    """The values with the digits of a file, and no negative zero."""
+    flat = [float(f"{value:.{DIGITS}g}") + 0.0 for value in np.ravel(values)]
     return np.array(flat, dtype=np.float64).reshape(np.shape(values))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import correlate
 
+import ident.diagnosis.bench as bench_module
 from ident.diagnosis.bench import again_with
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.noise import _misfit, beside_healthy
@@ -50,20 +51,29 @@ def test_noise_beside_a_healthy_arm_is_counted_as_its_gains_were(
     assert inflation.tolist() == [10.0 if value >= 0.1 else 1.0 for value in expected]
 
 
-def test_what_a_coarse_law_leaves_of_a_fault_is_no_noise(make: Make, chain: Chain) -> None:
-    """A drift told as a step leaves five times the healthy noise in its rows, and would no longer be seen in it."""
+def test_what_a_coarse_law_leaves_of_a_fault_is_no_noise(
+    make: Make, chain: Chain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A drift told as a step leaves more than the noise, and for long: counted as noise, it would hide the fault."""
     bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
     side, joint = "joint", 1
-    column = np.sin(np.arange(len(bench.nominal.rows[side].time)))[:, None]
-    rows = {(side, joint): column}
+    rows = {(side, joint): np.sin(np.arange(len(bench.nominal.rows[side].time)))[:, None]}
     score = bench.evidence.score(bench.evidence.padded(rows))
     trial = Trial(Candidate(EFFECTS["sensor_ripple"], joint), Shape(), score, rows)
     selection = Selection([Claim(trial, score)], {}, {})
-    after = again_with(bench, selection, DiagnosisSettings(), None)
-    assert after is not None
-    left = after.evidence.sigma[side][joint]
-    for noise, kept in ((0.2 * left, 0.4 * left), (0.8 * left, left), (3.0 * left, left)):
-        bench.evidence.sigma[side][joint] = noise
+    sigma, inflation = bench.evidence.sigma[side], bench.evidence.variance_inflation[side]
+    sigma[:], inflation[:] = 0.1, 10.0
+    for left, lasting, kept in (
+        (0.5, 10.0, (0.1, 10.0)),
+        (0.1, 90.0, (0.1, 10.0)),
+        (0.05, 90.0, (0.05, 40.0)),
+        (0.05, 20.0, (0.05, 20.0)),
+    ):
+        told = {name: (np.full(7, left), np.full(7, lasting)) for name in bench.nominal.rows}
+        sizes, counts = ({name: pair[k] for name, pair in told.items()} for k in (0, 1))
+        monkeypatch.setattr(bench_module, "_noise", lambda *_, s=sizes, c=counts: (s, c, s, False))
         again = again_with(bench, selection, DiagnosisSettings(), None)
         assert again is not None
-        assert again.evidence.sigma[side][joint] == pytest.approx(kept, rel=0.05)
+        found = again.evidence.sigma[side], again.evidence.variance_inflation[side]
+        assert (found[0][joint], found[1][joint]) == pytest.approx(kept)
+        assert (found[0][0], found[1][0]) == (0.1, 10.0)

@@ -110,3 +110,10 @@ def test_a_variance_without_a_point_is_read_back(tmp_path: Path) -> None:
     written = model(1e-12 * np.eye(3))
     write_model(written, path)
     assert np.allclose(read_model(path).covariance, written.covariance, rtol=1e-9)
+
+
+def test_a_negative_zero_beside_a_known_parameter_is_read_back(tmp_path: Path) -> None:
+    covariance = np.diag([1.0, 0.0, 2.0])
+    covariance[1, 0] = covariance[0, 1] = covariance[1, 2] = covariance[2, 1] = -0.0
+    write_model(model(covariance), tmp_path / "m.yaml")
+    np.testing.assert_array_equal(read_model(tmp_path / "m.yaml").covariance, covariance)
