@@ -10,7 +10,7 @@ import numpy as np
 from fri.errors import DataError
 from ident.diagnosis.candidates import Dictionary, Trial
 from ident.diagnosis.evidence import Evidence
-from ident.diagnosis.noise import beside_healthy, noise_floor, repeatability
+from ident.diagnosis.noise import misfit, noise_floor, repeatability
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal, structure_of
 from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.products import Floats
@@ -165,7 +165,7 @@ def _evidence(
     prior: tuple[Floats, Floats] | None,
     healthy: Reference | None = None,
 ) -> tuple[Evidence, bool]:
-    """Evidence with the noise floor of a first fit, see `beside_healthy`. Without a healthy arm the prior keeps base
+    """Evidence with the noise of a first fit, and no more than on the `healthy` arm. Without one the prior keeps base
     parameters with weak excitation near the drawing; repeated periods make their uncertainty known, so it is left out.
     """
     compared = healthy is not None
@@ -174,22 +174,27 @@ def _evidence(
     if compared and len(nominal.rows) == 2:
         # Gains of other days are no noise.
         first.replace(list(gain_rows(Dictionary(nominal, first, ())).values()))
-    sigma, inflation, floor, repeatable = _noise(nominal, first.residuals())
+    sigma, inflation, floor, repeatable = _noise(nominal, first.residuals(), compared=compared)
     if healthy is not None:
+        # A strong cause is no noise.
         for side in sigma.keys() & healthy.correlated.keys():
-            sigma[side], inflation[side] = beside_healthy(
-                (sigma[side], inflation[side]),
-                (healthy.noise[side], healthy.correlated[side]),
-                repeatable=repeatable,
-            )
+            quiet = healthy.noise[side] ** 2 * healthy.correlated[side] < sigma[side] ** 2 * inflation[side]
+            sigma[side] = np.where(quiet, healthy.noise[side], sigma[side])
+            inflation[side] = np.where(quiet, healthy.correlated[side], inflation[side])
     if repeatable and not compared:
         prior = None
     return Evidence(nominal, settings, sigma, inflation, prior, compared=compared, floor=floor), repeatable
 
 
-def _noise(nominal: Nominal, residual: Mapping[str, Floats]) -> tuple[_BySide, _BySide, _BySide, bool]:
+def _noise(
+    nominal: Nominal, residual: Mapping[str, Floats], *, compared: bool
+) -> tuple[_BySide, _BySide, _BySide, bool]:
     """By side, (n,): noise of a row [Nm], its variance inflation, and its repeatability [Nm] from periods, else from
-    sessions with the same motion, else from the residual; and whether all noise comes from periods."""
+    sessions with the same motion, else from the residual; and whether periods tell it.
+
+    compared : with a healthy arm. Then the noise is the residual, for what its model lacks differs from motion to
+    motion.
+    """
     periods = {r.number: (r.start_s, r.period_s) for r in nominal.recordings}
     sigma, inflation, floor, known = {}, {}, {}, True
     for side, rows in nominal.rows.items():
@@ -199,6 +204,8 @@ def _noise(nominal: Nominal, residual: Mapping[str, Floats]) -> tuple[_BySide, _
             between = repeatability(nominal.recordings, rows, residual[side])
             floor[side] = np.where(np.isfinite(between), between, floor[side])
         known &= repeatable
+        if compared:
+            sigma[side], inflation[side] = misfit(rows, residual[side])
     return sigma, inflation, floor, known
 
 
@@ -269,7 +276,7 @@ def again_with(
         return None
     nominal, evidence = bench.nominal, bench.evidence
     evidence.replace([*(c.trial.rows for c in selection.claims), *selection.nuisance_rows])
-    new_sigma, new_inflation, floor, _ = _noise(nominal, evidence.residuals())
+    new_sigma, new_inflation, floor, _ = _noise(nominal, evidence.residuals(), compared=evidence.compared)
     sigma = {side: value.copy() for side, value in evidence.sigma.items()}
     inflation = {side: value.copy() for side, value in evidence.variance_inflation.items()}
     # Rows without a claim keep their noise: the null was counted in it. What claims leave of a fault is no noise.

@@ -26,6 +26,7 @@ from ident.diagnosis.channel_delays import CHANNELS, channel_delays, common_dela
 from ident.diagnosis.character import character
 from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std, habit, largest_left
 from ident.diagnosis.held_out import held_out
+from ident.diagnosis.noise import misfit
 from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.presliding import SlowTurns, presliding_length, slow_turns, with_far_presliding
 from ident.diagnosis.probes import remainder_gains
@@ -64,10 +65,10 @@ _END = 1.05
 
 @dataclass(frozen=True, eq=False)
 class _Day:
-    """Results of one set: base parameters (p,) and covariance (p, p), noise of a row by side and the rows that count as
-    one for it, Coulomb friction of the drives (n,) [Nm] and its slow part, see `slow_turns`; delays of the channels
-    beyond the arm's, with standard deviation, by side [s]. torque_rms : of the rows by side, (n,) [Nm]. masses :
-    announced, of its payloads [kg]. whole : the parameters (p,) with the friction of each drive as a whole.
+    """Results of one set: base parameters (p,) and covariance (p, p), what the model leaves of a row by side and the
+    rows that count as one for it, Coulomb friction of the drives (n,) [Nm] and its slow part, see `slow_turns`; delays
+    of the channels beyond the arm's, with standard deviation, by side [s]. torque_rms : of the rows by side, (n,) [Nm].
+    masses : announced, of its payloads [kg]. whole : the parameters (p,) with the friction of each drive as a whole.
     gains : (2, n) errors of the torque sensors' gains with standard deviations, NaN where unknown.
     """
 
@@ -304,13 +305,15 @@ def _day(
     selection = select(bench.dictionary, evidence, settings, None)
     nuisance, p = selection.nuisance, evidence.base_count
     values = evidence.full.values[:p].copy()
+    residual = evidence.residuals()
+    noise = {side: misfit(rows, residual[side]) for side, rows in bench.nominal.rows.items()}
     return _Day(
         bench.nominal.base,
         bench.nominal.masses,
         values,
         evidence.covariance()[:p, :p],
-        evidence.sigma,
-        evidence.variance_inflation,
+        {side: sigma for side, (sigma, _) in noise.items()},
+        {side: inflation for side, (_, inflation) in noise.items()},
         {side: np.sqrt(np.mean(rows.target**2, axis=0)) for side, rows in bench.nominal.rows.items()},
         bench.nominal.motions[0].motor_coulomb,
         slow_turns(bench.nominal, bench.evidence),

@@ -43,7 +43,7 @@ def noise_floor(
         close = np.abs(rows.time[first[nearest]] - at) < 0.6 * step
         pairs.append((residual[second[close]] - residual[first[nearest[close]]]) / np.sqrt(2.0))
     if not pairs:
-        return *_misfit(rows, residual), False
+        return *misfit(rows, residual), False
     sigma, inflation = np.ones(n), np.ones(n)
     differences = np.concatenate(pairs)
     dt = max(float(np.median(np.diff(rows.time))), 1e-6)
@@ -61,19 +61,6 @@ def noise_floor(
             ratio = float(np.clip(width * np.mean(means**2) / np.mean(d**2), 1.0, width))
             inflation[j] = 1.0 if ratio < 1.0 + 3.0 * np.sqrt(2.0 / count) else ratio
     return sigma, inflation, True
-
-
-def beside_healthy(
-    own: tuple[Floats, Floats], healthy: tuple[Floats, Floats], *, repeatable: bool
-) -> tuple[Floats, Floats]:
-    """Noise (n,) of a row [Nm] and its variance inflation (n,) in sessions held against a healthy arm's.
-
-    No more than the healthy noise, for a strong cause is no noise. Where periods repeat they show the noise of the
-    sensors alone, without what the healthy model lacks: then no less, for the gains of causes on the healthy arm were
-    counted in its noise.
-    """
-    take = (healthy[0] ** 2 * healthy[1] < own[0] ** 2 * own[1]) != repeatable
-    return np.where(take, healthy[0], own[0]), np.where(take, healthy[1], own[1])
 
 
 def repeatability(recordings: Sequence[SessionRecord], rows: SideRows, residual: Floats) -> Floats:
@@ -109,7 +96,7 @@ def _same_motion(one: SessionRecord, other: SessionRecord) -> bool:
     return True
 
 
-def _misfit(rows: SideRows, residual: Floats) -> tuple[Floats, Floats]:
+def misfit(rows: SideRows, residual: Floats) -> tuple[Floats, Floats]:
     """Size (n,) of the residual and its variance inflation (n,), the number of rows counting as one, from the
     autocorrelation."""
     n = residual.shape[1]

@@ -11,7 +11,7 @@ from scipy.signal import correlate
 import ident.diagnosis.bench as bench_module
 from ident.diagnosis.bench import again_with
 from ident.diagnosis.candidates import Candidate, Trial
-from ident.diagnosis.noise import _misfit, beside_healthy
+from ident.diagnosis.noise import misfit
 from ident.diagnosis.selection import Claim, Selection
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.signatures import signature_bench
@@ -29,7 +29,7 @@ def test_noise_of_a_residual_follows_its_autocorrelation(make: Make, chain: Chai
     white = random.normal(size=rows.target.shape)
     residual = np.array([np.convolve(column, np.ones(6) / 6.0, "same") for column in white.T]).T
     residual[random.uniform(size=residual.shape) < 0.1] = np.nan
-    sigma, inflation = _misfit(rows, residual)
+    sigma, inflation = misfit(rows, residual)
     total = np.zeros(0)
     for session in np.unique(rows.session):
         d = np.nan_to_num(residual[(rows.session == session) & ~rows.test, 0])
@@ -38,17 +38,6 @@ def test_noise_of_a_residual_follows_its_autocorrelation(make: Make, chain: Chai
     assert sigma[0] == pytest.approx(np.sqrt(np.nanmean(residual[~rows.test, 0] ** 2)))
     assert inflation[0] == pytest.approx(correlation_time(total))
     assert 4.0 < inflation[0] < 8.0
-
-
-@pytest.mark.parametrize(("repeatable", "expected"), [(False, [0.02, 0.1]), (True, [0.1, 0.3])])
-def test_noise_beside_a_healthy_arm_is_counted_as_its_gains_were(
-    repeatable: bool, expected: list[float]
-) -> None:
-    """Ten rows count as one in the healthy noise of 0.1 Nm, and one in that of the periods."""
-    own = np.array([0.02, 0.3]), np.array([1.0, 10.0])
-    sigma, inflation = beside_healthy(own, (np.full(2, 0.1), np.full(2, 10.0)), repeatable=repeatable)
-    assert sigma.tolist() == expected
-    assert inflation.tolist() == [10.0 if value >= 0.1 else 1.0 for value in expected]
 
 
 def test_what_a_coarse_law_leaves_of_a_fault_is_no_noise(
@@ -71,7 +60,7 @@ def test_what_a_coarse_law_leaves_of_a_fault_is_no_noise(
     ):
         told = {name: (np.full(7, left), np.full(7, lasting)) for name in bench.nominal.rows}
         sizes, counts = ({name: pair[k] for name, pair in told.items()} for k in (0, 1))
-        monkeypatch.setattr(bench_module, "_noise", lambda *_, s=sizes, c=counts: (s, c, s, False))
+        monkeypatch.setattr(bench_module, "_noise", lambda *_, compared, s=sizes, c=counts: (s, c, s, False))
         again = again_with(bench, selection, DiagnosisSettings(), None)
         assert again is not None
         found = again.evidence.sigma[side], again.evidence.variance_inflation[side]
