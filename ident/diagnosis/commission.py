@@ -47,6 +47,7 @@ from ident.estimation.turning import drive_coulomb
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.content import Recall
+from ident.rows.data_quality import all_losses
 from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -194,7 +195,17 @@ def commission(
         usual=usual_sizes(tables),
         compliance_std=known.compliance_std,
         left=largest_left(left),
+        lost=_largest_losses(parts),
     )
+
+
+def _largest_losses(sets: Sequence[Sequence[Session]]) -> dict[str, float]:
+    """Largest share of lost, repeated and stale samples of a session, by channel with any."""
+    found: dict[str, float] = {}
+    for loss in all_losses(session for part in sets for session in part):
+        if loss.amiss:
+            found[loss.channel] = max(round(loss.share, 6), found.get(loss.channel, 0.0))
+    return found
 
 
 class _Tuned(NamedTuple):

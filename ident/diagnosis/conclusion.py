@@ -82,9 +82,10 @@ def conclude(task: Task, state: State) -> Diagnosis:
     doubts += [f for f, is_one in zip(findings, is_told, strict=True) if not is_one]
     findings = [f for f, is_one in zip(findings, is_told, strict=True) if is_one]
     findings += [*state.loads, *worn]
-    loss = sample_loss(list(task.sessions))
-    if loss:
-        findings.append(loss_finding(loss[0]))
+    usual = {} if task.reference is None else task.reference.lost
+    losses = [one for one in sample_loss(task.sessions) if one.beyond(usual.get(one.channel, 0.0))]
+    if losses:
+        findings.append(loss_finding(losses[0]))
     findings += limit_findings(nominal.recordings, findings)
     doubts = [d for d in doubts if not any((d.cause, d.joints) == (f.cause, f.joints) for f in findings)]
     findings = in_order(sorted(findings, key=lambda f: -f.gain), evidence.floor)

@@ -70,7 +70,8 @@ class Reference:
     chance, and half of a stated compliance that the sets do not tell. shown : mean information of the sets on each
     candidate, by shape of its grid: the fall of the chi-square for a unit of its coefficients. usual : size of each
     candidate on the healthy arm. left : largest rms (n,) [Nm] by side of a held-out session of a healthy set, beside
-    what differs from day to day; empty if unknown.
+    what differs from day to day; empty if unknown. lost : largest share of lost, repeated and stale samples of a
+    healthy session, by channel.
     """
 
     model: DynamicModel
@@ -93,6 +94,7 @@ class Reference:
     shown: Mapping[tuple[str, int], Mapping[str, float]] = field(default_factory=dict)
     usual: Mapping[tuple[str, int], UsualSize] = field(default_factory=dict)
     left: Mapping[str, Floats] = field(default_factory=dict)
+    lost: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def unknown_stiffness(self) -> tuple[str, ...]:
@@ -141,6 +143,7 @@ class Reference:
             )
             delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
             delay_std = {side: float(v) for side, v in stored.get("delay_std_s", {}).items()}
+            lost = {channel: float(v) for channel, v in stored.get("lost", {}).items()}
             sets, encoder = int(stored["sets"]), str(stored["encoder"])
             presliding, far, far_share, compliance_std = (
                 np.array(stored[name], dtype=np.float64) if stored.get(name) else None
@@ -181,6 +184,7 @@ class Reference:
             shown,
             usual,
             left,
+            lost,
         )
 
     def stored(self) -> dict[str, Any]:
@@ -195,6 +199,7 @@ class Reference:
                 "noise": {side: _listed(values) for side, values in self.noise.items()},
                 "correlated": {side: _listed(values) for side, values in self.correlated.items()},
                 "left": {side: _listed(values) for side, values in self.left.items()},
+                "lost": dict(self.lost),
                 "null": {
                     f"{cause} {joint + 1}": round(float(v), 2) for (cause, joint), v in self.null.items()
                 },

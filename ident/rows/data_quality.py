@@ -48,6 +48,8 @@ _BESIDE, _AROUND, _BEYOND_ALL = 10.0, 5, 3.0
 # A frozen torque: least length over nearly all (the quantile) of its other runs of one value, and least share of the
 # samples at that value in one run. A dead zone or a coarse sensor comes back to its values again and again.
 _LONGER, _NEARLY, _ONE_RUN = 20.0, 0.99, 0.8
+# Factor on a usual share of lost samples from day to day, and standard deviations of their number beyond it.
+_TWICE, _BY_CHANCE = 2.0, 3.0
 # Latest recordings whose frozen positions and jumps are known: an estimator prepares a session several times.
 _MOST_KNOWN = 64
 # Least way of a joint in two seconds, or speed for a shorter time, to be in motion [rad or m].
@@ -86,6 +88,11 @@ class SampleLoss:
         """Whether number and share are beyond chance."""
         return self.amiss >= _LEAST_AMISS and self.share > _SHARE
 
+    def beyond(self, usual: float) -> bool:
+        """Whether the share is more than twice a usual one, and that beyond chance."""
+        expected = _TWICE * usual * (self.samples + self.lost)
+        return self.amiss > expected + _BY_CHANCE * float(np.sqrt(expected))
+
 
 @dataclass(frozen=True)
 class Stuck:
@@ -115,15 +122,20 @@ class Jump:
     size: float
 
 
-def sample_loss(sessions: list[Session]) -> tuple[SampleLoss, ...]:
-    """The channels with relevant losses, worst first."""
-    found = [
+def all_losses(sessions: Iterable[Session]) -> list[SampleLoss]:
+    """The losses of all channels, none included."""
+    return [
         _channel(session.path.name, name, columns)
         for session in sessions
         for name, columns in (("joint", session.joint), ("motor", session.motor))
         if columns is not None
     ]
-    return tuple(sorted((loss for loss in found if loss.matters), key=lambda loss: -loss.share))
+
+
+def sample_loss(sessions: Iterable[Session]) -> tuple[SampleLoss, ...]:
+    """The channels with relevant losses, worst first."""
+    found = [loss for loss in all_losses(sessions) if loss.matters]
+    return tuple(sorted(found, key=lambda loss: -loss.share))
 
 
 def stale(columns: JointColumns) -> Flags:

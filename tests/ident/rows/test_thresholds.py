@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ident.rows.data_quality import (
+    SampleLoss,
     _behind,
     _flat,
     _jolts,
@@ -167,6 +168,17 @@ def test_old_samples_are_counted_once_with_those_lost() -> None:
     (found,) = sample_loss([session(columns(effort, position))])
     assert (found.session, found.channel) == ("run.mcap", "joint")
     assert (found.lost, found.repeated, found.stale, found.samples) == (0, 0, 3, 400)
+
+
+@pytest.mark.parametrize(
+    ("lost", "usual", "beyond"),
+    [(20, 0.0, True), (20, 0.01, False), (33, 0.01, False), (34, 0.01, True), (40, 0.02, False)],
+)
+def test_losses_are_told_beyond_twice_the_usual_share_and_chance(
+    lost: int, usual: float, beyond: bool
+) -> None:
+    """Of 1000 samples; twice a hundredth are 20, and three standard deviations of them 13.4."""
+    assert SampleLoss("run.mcap", "joint", lost, 0, 0, 1000 - lost).beyond(usual) is beyond
 
 
 @pytest.mark.parametrize(("share", "silent"), [(3e-6, True), (1e-4, False)])
