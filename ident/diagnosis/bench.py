@@ -28,6 +28,8 @@ _BySide = dict[str, Floats]
 _SLOW_S = 0.1
 # Sides of the parameters of friction in units of torque.
 _BORNE: dict[str, Side] = {"Fcl": "joint", "offl": "joint", "Fcm": "motor", "offm": "motor"}
+# Standard deviation of a parameter that neither rows nor a healthy arm tell: beyond those of any arm [SI units].
+_ANYTHING = 1e3
 # Largest relative change of a compliance in a step.
 _LARGEST_STEP = 0.35
 _FACTORS = (0.5, 0.7, 1.0, 1.4)
@@ -124,8 +126,12 @@ def prepare_bench(
     fitted = fit_compliance and np.any(arm.compliance > 0.0) and len(nominal.rows) == 2
     # Predictions of the second round include the reference; a third changes nothing.
     rounds = 3 if fitted else 2 if reference is not None else 1
-    compared = reference is not None
-    evidence, repeatable = _evidence(nominal, settings, None if compared else prior)
+    # These days alone come first, but for what only a channel left out would tell.
+    whole = all(bool(np.any(rows.valid, axis=0)[nominal.moving].all()) for rows in nominal.rows.values())
+    if prior is not None and not whole:
+        unknown = np.diag(prior[0]) <= 0.0
+        prior = prior[0] + np.diag(np.where(unknown, _ANYTHING**-2.0, 0.0)), prior[1]
+    evidence, repeatable = _evidence(nominal, settings, None if reference is not None and whole else prior)
     for _ in range(rounds):
         nominal.refine(evidence.full.values[: len(base)])
         evidence, repeatable = _evidence(nominal, settings, prior, reference)
