@@ -125,6 +125,23 @@ def test_a_late_channel_is_held_against_rows_away_from_reversals_where_these_tel
     assert found.confidence > 0.9
 
 
+def test_parameters_that_only_the_channels_left_out_tell_stay_those_of_the_healthy_arm(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def interchanged(session: Session) -> Session:
+        assert session.motor is not None
+        return replace(session, motor=replace(session.motor, effort=session.motor.effort[:, [0, 2, 1]]))
+
+    found = diagnose([interchanged(s) for s in alone(make, 41)], chain, reference=reference)
+    assert sorted((one.channel, one.joint) for one in found.data) == [
+        ("motor torque", 2),
+        ("motor torque", 3),
+    ]
+    assert not found.findings
+    assert np.all(np.isfinite(found.base_model.values))
+    assert np.max(np.abs(found.base_model.values)) < 1e2
+
+
 def test_friction_is_compared_with_that_of_sessions_with_the_same_torques(chain: Chain) -> None:
     both = numeric_base(ModelStructure(chain, 2), (Condition(None, ("motor", "joint")),))
     of_drives = numeric_base(ModelStructure(chain, 2, without=LINK_FRICTION), (Condition(None, ("motor",)),))

@@ -40,6 +40,23 @@ def test_noise_of_a_residual_follows_its_autocorrelation(make: Make, chain: Chai
     assert 4.0 < inflation[0] < 8.0
 
 
+def test_noise_beside_a_healthy_arm_is_what_the_model_leaves(
+    make: Make, chain: Chain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Periods tell that of the sensors alone, and what a model lacks differs from motion to motion."""
+    bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
+    of_periods = np.full(chain.n, 1e-6), np.ones(chain.n), True
+    monkeypatch.setattr(bench_module, "noise_floor", lambda *_: of_periods)
+    residual = bench.evidence.residuals()
+    for compared in (False, True):
+        sigma, inflation, floor, repeats = bench_module._noise(bench.nominal, residual, compared=compared)
+        for side, rows in bench.nominal.rows.items():
+            expected = misfit(rows, residual[side]) if compared else of_periods[:2]
+            np.testing.assert_array_equal((sigma[side], inflation[side]), expected)
+            assert repeats
+            assert np.nanmax(floor[side]) == 1e-6
+
+
 def test_what_a_coarse_law_leaves_of_a_fault_is_no_noise(
     make: Make, chain: Chain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
