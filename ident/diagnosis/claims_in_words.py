@@ -118,7 +118,7 @@ def finding_statement(
         rows = [f"{joints_text([joint], names)} {side}" for side, joint in evidence.get("rows") or ()]
         label = ", ".join(["error on held-out data", *rows]) if len(rows) == 1 else "error on held-out data"
         low, high = evidence.get("gain_interval_95") or (math.nan, math.nan)
-        gain = f", less by {low:.3g} to {high:.3g} Nm (95 %)" if low <= high else ""
+        gain = f", less by {low:.3g} to {high:.3g} Nm (95 %)" if low < high else ""
         told = f"{before:.3g} -> {after:.3g} Nm{gain}"
         # A change between sessions shows as a change, and seldom in a further session.
         facts.append((label, f"{told}; they do not show it" if low <= 0.0 else told))

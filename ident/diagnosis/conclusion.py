@@ -325,7 +325,7 @@ def _notes(task: Task, bench: DiagnosisBench, measured: Mapping[str, Floats]) ->
     if len(still):
         names = ", ".join(nominal.arm.chain.joint_names[j] for j in still)
         notes.append(f"{names}: no motion of {TRAVEL_RAD} rad or more, so no diagnosis there")
-    if not bench.repeatable:
+    if not bench.repeatable and not evidence.compared:
         notes.append(
             "no motion repeats within a session: the residual of the model is the only measure of noise, so only "
             "causes of a large part of it are named"

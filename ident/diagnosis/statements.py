@@ -354,8 +354,12 @@ def _lines(
         worse = _worse(details, names)
         text += f"; worse: {', '.join(worse)}" if worse else ""
         if findings and content.get("extension") == []:
-            text = "the base model: no cause here lasts and lessens the error of held-out sessions"
-        found.append(Line("extended model", text, "less", "look" if worse or gain <= 0.0 else "good", "gain"))
+            text = "the same as the base model, for no cause here lasts and lessens the error of held-out sessions"
+            found.append(Line("extended model", text, "", "good", "gain"))
+        else:
+            found.append(
+                Line("extended model", text, "less", "look" if worse or gain <= 0.0 else "good", "gain")
+            )
     found += _replay_line(content)
     count = len(details.get("notes", []))
     if count:

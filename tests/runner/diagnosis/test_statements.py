@@ -153,7 +153,11 @@ def test_an_extended_model_without_the_causes_and_rows_that_it_worsens_are_named
     assert line.found.endswith("; worse: E1 motor")
     said = statements({**CONTENT, "extension": []}, details(rows=rows), NAMES)
     line = next(one for one in said.lines if one.subject == "extended model")
-    assert line.found == "the base model: no cause here lasts and lessens the error of held-out sessions"
+    assert (
+        line.found
+        == "the same as the base model, for no cause here lasts and lessens the error of held-out sessions"
+    )
+    assert (line.wanted, line.level) == ("", "good")
 
 
 def test_the_gain_of_test_sessions_has_all_samples_first_and_then_the_rows() -> None:
