@@ -34,6 +34,9 @@ _ANYTHING = 1e3
 _LARGEST_STEP = 0.35
 _FACTORS = (0.5, 0.7, 1.0, 1.4)
 
+# Largest noise beside the claims, over that before: the law of a cause is coarse, and a healthy arm's noise is known.
+_LOUDER = 2.0
+
 STATED_WITHIN = 2.0
 """Factor within which a stiffness of the arm's description is known."""
 UNSURE = 0.5
@@ -287,8 +290,8 @@ def again_with(
     inflation = {side: value.copy() for side, value in evidence.variance_inflation.items()}
     # Rows without a claim keep their noise: the null was counted in it. What claims leave of a fault is no noise.
     for side, joint in {key for c in selection.claims for key in c.trial.rows}:
-        most = sigma[side][joint] ** 2 * inflation[side][joint]
-        sigma[side][joint] = min(new_sigma[side][joint], sigma[side][joint])
+        most = _LOUDER**2 * sigma[side][joint] ** 2 * inflation[side][joint]
+        sigma[side][joint] = min(new_sigma[side][joint], _LOUDER * sigma[side][joint])
         inflation[side][joint] = min(new_inflation[side][joint], most / sigma[side][joint] ** 2)
     nominal.refine(evidence.full.values[: evidence.base_count])
     again = Evidence(

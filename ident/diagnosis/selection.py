@@ -9,6 +9,7 @@ tolerance, so they neither hide nor mimic a cause.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -42,8 +43,9 @@ _SAME_ROWS = 0.2
 _LAW_ERROR, _MOSTLY = 0.1, 0.8
 # Least time between two separate pushes [s].
 _PAUSE_S = 0.2
-# Habits of the arm that are tolerated: least gain, least share of the best candidate's gain, and number.
-_LEAST_HABIT, _NEAR, _MOST_HABITS = 100.0, 0.5, 4
+# Habits of the arm that are tolerated: least gain, least share of the best candidate's gain, number of candidates, and
+# of shapes of each.
+_LEAST_HABIT, _NEAR, _MOST_HABITS, _SHAPES = 100.0, 0.5, 4, 2
 # Least gain of `best_candidate`.
 _LEAST_GAIN = 10.0
 # Confidence in a sensor's error with a record of the joint torque only.
@@ -300,7 +302,11 @@ class State:
         one. A change from day to day that is not in the model would pass for other causes."""
         known = [one for one in self.tolerated() if one.name.startswith(HABIT)]
         near = [t for t in found if t.score.gain > max(_LEAST_HABIT, _NEAR * found[0].score.gain)]
-        for trial in near if len(known) < _MOST_HABITS else ():
+        shapes = Counter(one.of for one in known)
+        for trial in near:
+            key = trial.candidate.key
+            if shapes[key] == _SHAPES or (key not in shapes and len(shapes) == _MOST_HABITS):
+                continue
             single = len(trial.score.coefficients) == 1 and not trial.candidate.effect.event
             if single and not self.carried(trial) and self.carried(trial, healthy=False):
                 log.info("%s: gain %.0f, as on healthy days", trial.candidate.key, trial.score.gain)

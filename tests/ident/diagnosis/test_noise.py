@@ -70,9 +70,9 @@ def test_what_a_coarse_law_leaves_of_a_fault_is_no_noise(
     sigma, inflation = bench.evidence.sigma[side], bench.evidence.variance_inflation[side]
     sigma[:], inflation[:] = 0.1, 10.0
     for left, lasting, kept in (
-        (0.5, 10.0, (0.1, 10.0)),
-        (0.1, 90.0, (0.1, 10.0)),
-        (0.05, 90.0, (0.05, 40.0)),
+        (0.5, 10.0, (0.2, 10.0)),
+        (0.1, 90.0, (0.1, 40.0)),
+        (0.05, 300.0, (0.05, 160.0)),
         (0.05, 20.0, (0.05, 20.0)),
     ):
         told = {name: (np.full(7, left), np.full(7, lasting)) for name in bench.nominal.rows}
