@@ -38,6 +38,9 @@ _PADDING = 4
 _RIDGE = 1e-3
 # Least explained share of the noise; generic functions find a little everywhere.
 _LEAST_INFLATION = 0.012
+# Least gain of a function beside a line, over that of the line: its frequency is known to a bin, and what is left of it
+# is no function of the motion.
+_OF_LINE = 0.1
 
 
 def find_line(evidence: Evidence, side: str, joint: int, residual: Floats) -> tuple[float, Rows, int] | None:
@@ -233,6 +236,7 @@ def _one(
         least = least_gain + 2.0 * (len(score.coefficients) + np.log(choices))
         if score.gain > least and score.inflation > _LEAST_INFLATION:
             line_hz = frequency
+            least_gain = max(least_gain, _OF_LINE * score.gain)
             taken.append(("time", score, waves))
             evidence.replace([*fixed, waves])
     for _ in range(2):
