@@ -213,7 +213,7 @@ def _noise(
             between = repeatability(nominal.recordings, rows, residual[side])
             floor[side] = np.where(np.isfinite(between), between, floor[side])
         known &= repeatable
-        if compared:
+        if compared and repeatable:
             sigma[side], inflation[side] = misfit(rows, residual[side])
     return sigma, inflation, floor, known
 

@@ -159,16 +159,20 @@ def commission(
         known = _later(known, open_s)
     known = replace(known, healthy=character(known, recorded, settings))
     days = [_day(known, recordings, settings, base) for recordings in recorded]
-    whole = _reference(days, known, robot, parts[0], {})
+    found = _reference(days, known, robot or parts[0][0].metadata.get("robot", ""), parts[0])
     null: dict[tuple[str, int], float] = {}
     shown: dict[tuple[str, int], dict[str, float]] = {}
     tables, left = [], []
     for number, recordings in enumerate(recorded):
         others = [day for k, day in enumerate(days) if k != number]
-        rest = _reference(others, known, robot, parts[0], {}, days) if others else None
-        if rest is not None:
+        rest = None
+        if others:
             # All sets in the same noise, for their gains are compared.
-            rest = replace(rest, noise=whole.noise, correlated=whole.correlated)
+            rest = replace(
+                _reference(others, known, robot, parts[0], days),
+                noise=found.noise,
+                correlated=found.correlated,
+            )
         bench = prepare_bench(known, recordings, settings, rest, None, fit_compliance=False)
         own = gains(bench.dictionary, bench.evidence, settings)
         for key, gain in (own | remainder_gains(bench.dictionary, bench.evidence)).items():
@@ -180,7 +184,6 @@ def commission(
                 mean[shape] = mean.get(shape, 0.0) + value / len(parts)
         left.append(_left(known, recordings, settings, rest))
         log.info("healthy set %d of %d", number + 1, len(parts))
-    found = _reference(days, known, robot or parts[0][0].metadata.get("robot", ""), parts[0], null)
     provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals) | known.delays}
     # From day to day a delay differs by as much as either kind of rows shows.
     changes = dict(found.delay_std_s)
@@ -190,6 +193,7 @@ def commission(
     return replace(
         found,
         model=replace(found.model, provenance=provenance),
+        null=null,
         delay_std_s=changes,
         shown=shown,
         usual=usual_sizes(tables),
@@ -371,10 +375,9 @@ def _reference(
     arm: NominalArm,
     robot: str,
     sessions: Sequence[Session],
-    null: Mapping[tuple[str, int], float],
     habits: Sequence[_Day] = (),
 ) -> Reference:
-    """The mean of days, with the changes from day to day of the `habits`, default of these days."""
+    """The mean of days, without the null, with the changes from day to day of the `habits`, default of these days."""
     kinds = [sorted(day.masses.items()) for day in days]
     usual = days[max(range(len(days)), key=lambda k: kinds.count(kinds[k]))]
     base, known = usual.base, [_known(day, usual) for day in days]
@@ -420,7 +423,7 @@ def _reference(
         arm.motor_delay_s,
         arm.joint_delay_s,
         noise,
-        null,
+        {},
         len(days),
         arm.encoder,
         arm.presliding,

@@ -75,7 +75,7 @@ def test_what_a_coarse_law_leaves_of_a_fault_is_no_noise(
         (0.05, 300.0, (0.05, 160.0)),
         (0.05, 20.0, (0.05, 20.0)),
     ):
-        told = {name: (np.full(7, left), np.full(7, lasting)) for name in bench.nominal.rows}
+        told = {name: (np.full(chain.n, left), np.full(chain.n, lasting)) for name in bench.nominal.rows}
         sizes, counts = ({name: pair[k] for name, pair in told.items()} for k in (0, 1))
         monkeypatch.setattr(bench_module, "_noise", lambda *_, compared, s=sizes, c=counts: (s, c, s, False))
         again = again_with(bench, selection, DiagnosisSettings(), None)
