@@ -33,6 +33,8 @@ _ABOUT_ONE = 0.3
 _VALLEY = 30.0
 # Least further fall of the chi-square by a recurring push.
 _TIED = 6.0
+# Least gain of a step for its rows to be made.
+_WORTH_ROWS = 10.0
 # Least time of a lasting step from the ends of a session, against their transients.
 _STEP_ROOM_S = 1.0
 # Longest pause between sessions over which a drive stays warm [s].
@@ -157,6 +159,11 @@ class Trial:
     score: Score
     rows: Rows = field(repr=False)
 
+    @property
+    def passing(self) -> bool:
+        """Whether it has no value in a further session."""
+        return self.candidate.effect.passing(self.shape)
+
 
 @dataclass(frozen=True)
 class _Span:
@@ -205,13 +212,15 @@ class Dictionary:
             for joint in ([-1] if EFFECTS[cause].whole_arm else np.flatnonzero(nominal.moving).tolist())
         )
         self._kept: dict[tuple[str, int], list[_Entry]] = {}
+        self._whole: dict[tuple[str, int, int], _Entry] = {}
         self._information: dict[tuple[str, int], dict[str, float]] = {}
         self._arena = Arena()
 
     def of(self, causes: Sequence[str] | None) -> Dictionary:
         """The same with fewer causes, and the columns made so far."""
         found = Dictionary(self.nominal, self.evidence, causes)
-        found._kept, found._information, found._arena = self._kept, self._information, self._arena
+        found._kept, found._whole = self._kept, self._whole
+        found._information, found._arena = self._information, self._arena
         return found
 
     def rows(self, candidate: Candidate, shape: Shape) -> Rows:
@@ -243,36 +252,42 @@ class Dictionary:
             self._kept[candidate.key] = [self._entry(shape, rows) for shape, rows in by_shape if _acts(rows)]
         return self._kept[candidate.key]
 
-    def _step(self, candidate: Candidate) -> Trial | None:
-        """The best edge of a block for an effect with an onset and no end. Products after an edge are a part of their
+    def _onset(self, candidate: Candidate) -> Trial | None:
+        """The best edge of a block for the forms that set in at a time. Products after an edge are a part of their
         blocks, so those of the whole session are made once."""
         evidence = self.evidence
-        best: tuple[Shape, Score, tuple[str, int]] | None = None
-        forms = list(dict.fromkeys(s.form for s in self._grid(candidate)))
+        best: tuple[Shape, Score, tuple[str, int, int]] | None = None
         sessions = sorted(set(evidence.block_session.tolist()))
-        for number, (form, session) in enumerate(product(forms, sessions)):
+        for number, (form, session) in enumerate(product(candidate.effect.onsets, sessions)):
             mine = np.flatnonzero(evidence.block_session == session)
             starts = evidence.block_start[mine]
+            edges = np.sort(starts)[1:]
+            edges = edges[
+                (edges >= _STEP_ROOM_S) & (edges <= self.setting.durations_s[session] - _STEP_ROOM_S)
+            ]
+            if not len(edges):
+                continue
             shape = Shape(form, time=starts.min() - 1.0, session=session + 1)
-            key = (candidate.cause, -2 - number)
-            if key not in self._kept:
-                self._kept[key] = [self._entry(shape, self.rows(candidate, shape))]
-            _, rows, known = self._kept[key][0]
+            key = (*candidate.key, number)
+            if key not in self._whole:
+                self._whole[key] = self._entry(shape, self.rows(candidate, shape))
+            _, rows, known = self._whole[key]
+            if not _acts(rows):
+                continue
             whole = evidence.products(partial(evidence.padded, rows), known)
-            for edge in np.sort(starts)[1:]:
-                if not _STEP_ROOM_S <= edge <= self.setting.durations_s[session] - _STEP_ROOM_S:
-                    continue
-                on = (evidence.block_session > session).astype(float)
-                on[mine[starts >= edge]] = 1.0
-                score = evidence.score_products(whole.only(on), list(rows))
-                score = evidence.event_score(score, evidence.blocks)
-                if best is None or score.gain > best[1].gain:
-                    best = (shape.at(time=edge), score, key)
+            on = np.ones((len(edges), evidence.blocks))
+            on[:, mine] = starts >= edges[:, None]
+            top = int(np.argmax(evidence.fitted(whole, on)))
+            score = evidence.score_products(whole.only(on[top]), list(rows))
+            at = shape.at(time=edges[top])
+            score = self._timed(candidate, at, score, evidence.blocks)
+            if best is None or score.gain > best[1].gain:
+                best = (at, score, key)
         if best is None or not candidate.effect.plausible(best[1].coefficients, best[0]):
             return None
         # The rows themselves are made only for a step with enough gain.
         shape, score, key = best
-        rows = self._kept[key][0][1] if score.gain < 10.0 else self.rows(candidate, shape)
+        rows = self._whole[key][1] if score.gain < _WORTH_ROWS else self.rows(candidate, shape)
         return Trial(candidate, shape, score, rows)
 
     def _grid(self, candidate: Candidate) -> Sequence[Shape]:
@@ -314,13 +329,12 @@ class Dictionary:
         """The candidate with the best shape of its grid, None without a plausible one."""
         if candidate.effect.repeats:
             return self._contacts(candidate)
-        if candidate.effect.step:
-            return self._step(candidate)
+        onset = self._onset(candidate)
         # Shapes that hold others of this candidate, and the others.
         found: dict[bool, Trial] = {}
         entries = self._prepared(candidate)
         for shape, rows, known in entries:
-            score = self.measure(candidate, rows, len(entries), known)
+            score = self.measure(candidate, rows, known)
             general = candidate.key in candidate.effect.special_cases(shape, candidate.joint)
             better = general not in found or _worth(score) > _worth(found[general].score)
             if better and candidate.effect.plausible(score.coefficients, shape):
@@ -328,6 +342,8 @@ class Dictionary:
         plain, wide = found.get(False), found.get(True)
         needed = wide is not None and (plain is None or exceeds(wide.score.gain, plain.score.gain))
         best = wide if needed else plain
+        if onset is not None and (best is None or _worth(onset.score) > _worth(best.score)):
+            return onset
         return None if best is None else self._simplified(best)
 
     def _simplified(self, trial: Trial) -> Trial:
@@ -346,7 +362,7 @@ class Dictionary:
         of its coefficients, beside the base alone. Empty for events, which are anywhere."""
         if candidate.key not in self._information:
             effect = candidate.effect
-            entries = [] if effect.repeats or effect.step or effect.event else self._prepared(candidate)
+            entries = [] if effect.event else self._prepared(candidate)
             self._information[candidate.key] = {
                 repr(shape): self.evidence.information(known) for shape, _, known in entries
             }
@@ -354,25 +370,21 @@ class Dictionary:
 
     def products(self, candidate: Candidate) -> Iterator[Products]:
         """Products of each shape of a candidate's grid with the base alone; none for events."""
-        effect = candidate.effect
-        entries = [] if effect.repeats or effect.step or effect.event else self._prepared(candidate)
+        entries = [] if candidate.effect.event else self._prepared(candidate)
         return (known for _, _, known in entries)
 
     def scores(self, candidate: Candidate) -> dict[str, Score]:
         """Score of each shape of a candidate's grid beside the present columns, by the shape as text; empty for
         events."""
-        effect = candidate.effect
-        entries = [] if effect.repeats or effect.step or effect.event else self._prepared(candidate)
-        found = {
-            repr(shape): self.measure(candidate, rows, len(entries), known) for shape, rows, known in entries
-        }
+        entries = [] if candidate.effect.event else self._prepared(candidate)
+        found = {repr(shape): self.measure(candidate, rows, known) for shape, rows, known in entries}
         return {shape: score for shape, score in found.items() if np.isfinite(score.gain)}
 
     def scored(self, candidate: Candidate, shape: str) -> Score | None:
         """Score of a shape of the grid beside the present columns; None without it."""
         for one, rows, known in self._kept.get(candidate.key, ()):
             if repr(one) == shape:
-                return self.measure(candidate, rows, 1, known)
+                return self.measure(candidate, rows, known)
         return None
 
     def nearest(self, trial: Trial) -> str:
@@ -386,23 +398,27 @@ class Dictionary:
 
         return repr(min(alike, key=distance)) if alike else ""
 
-    def measure(
-        self, candidate: Candidate, rows: Rows, choices: int = 1, known: Products | None = None
-    ) -> Score:
+    def measure(self, candidate: Candidate, rows: Rows, known: Products | None = None) -> Score:
         """Score of rows by the rules of the candidate's effect; `known` : their products with the base alone."""
         evidence, pull = self.evidence, _ABOUT_ONE**-2.0 if candidate.effect.hidden else 0.0
         if known is None:
-            score = evidence.score(evidence.padded(rows), pull=pull)
-        else:
-            score = evidence.score_rows(rows, known, pull=pull)
-        return evidence.event_score(score, choices) if candidate.effect.event else score
+            return evidence.score(evidence.padded(rows), pull=pull)
+        return evidence.score_rows(rows, known, pull=pull)
+
+    def _timed(self, candidate: Candidate, shape: Shape, score: Score, choices: int) -> Score:
+        """The score of a shape, with the price of its time. An error of a sensor that stays has parts to be held back,
+        too."""
+        if not candidate.effect.timed(shape):
+            return score
+        priced = self.evidence.event_score(score, choices)
+        return priced if candidate.effect.event else replace(priced, gain=min(priced.gain, score.gain))
 
     def trial(self, candidate: Candidate, shape: Shape, choices: int = 1) -> Trial | None:
         """The candidate with a given shape, None without rows or with implausible coefficients."""
         rows = self.rows(candidate, shape)
         if not _acts(rows):
             return None
-        score = self.measure(candidate, rows, choices)
+        score = self._timed(candidate, shape, self.measure(candidate, rows), choices)
         plausible = candidate.effect.plausible(score.coefficients, shape)
         return Trial(candidate, shape, score, rows) if plausible else None
 
@@ -431,7 +447,7 @@ class Dictionary:
                 method="bounded",
                 options={"maxiter": evaluations},
             )
-        spans = [] if trial.candidate.effect.event else self._spans(best)
+        spans = [] if trial.candidate.effect.timed(trial.shape) else self._spans(best)
         if len(spans) > 1 and best.score.fitted > _VALLEY:
             minimize(
                 lambda point: loss(spans, point),
@@ -451,7 +467,7 @@ class Dictionary:
             limits = next(p for p in effect.shape_parameters if p.name == name)
             here = float(trial.shape[name])
             low, high = _neighbours(values, here, signed=limits.low < 0.0 < limits.high)
-            if effect.step:
+            if trial.shape.form in effect.onsets:
                 last = self.setting.durations_s[int(trial.shape["session"]) - 1] - _STEP_ROOM_S
                 low, high = max(here - 2.5, _STEP_ROOM_S), min(here + 2.5, last)
             elif effect.event:
@@ -461,7 +477,7 @@ class Dictionary:
             least = effect.least(self.setting, max(trial.candidate.joint, 0)).get(name, limits.low)
             low, high = max(low, limits.low, least), min(high, limits.high)
             if low < high:
-                logarithmic = low > 0.0 and not effect.event
+                logarithmic = low > 0.0 and not effect.timed(trial.shape)
                 ends = (float(np.log(low)), float(np.log(high))) if logarithmic else (low, high)
                 found.append(_Span(name, *ends, logarithmic))
         return found

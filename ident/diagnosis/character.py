@@ -113,7 +113,7 @@ class _Set:
         return {
             t.candidate.key: t
             for t in self.state.simplest()
-            if _kind(t.candidate, t.shape) not in taken and t.candidate.effect.mode(t.shape) != "between"
+            if _kind(t.candidate, t.shape) not in taken and not t.passing
         }
 
     def trial(self, candidate: Candidate, shape: Shape) -> Trial | None:

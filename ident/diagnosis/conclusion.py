@@ -62,7 +62,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         Member((one.claim.trial.rows,), one.claim.gain, finding=finding)
         for one, finding in zip(kept, findings, strict=True)
         # A change between sessions has no value in a further one, and an event cannot be predicted.
-        if finding.mode != "between" and (nominal.held_out or not one.claim.trial.candidate.effect.event)
+        if not one.claim.trial.passing and (nominal.held_out or not one.claim.trial.candidate.effect.event)
     ]
     members += [
         Member(tuple(dict.fromkeys([(r.side, r.joint - 1)], t.column) for t in r.terms), r.gain, remainder=r)

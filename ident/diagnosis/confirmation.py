@@ -71,7 +71,7 @@ def confirmed(task: Task, state: State) -> list[Confirmed]:
         hardly = _excitation(claim, bench) < _EXCITED
         if _refuted(claim, finding, bench, fallen, hardly):
             continue
-        untested = _untested(claim, finding) or hardly
+        untested = _untested(claim) or hardly
         grounds = _grounds(claim, claims, finding, bench, without, after, fallen, untested, seed)
         most = 1.0 if _plain(claim, finding, bench, grounds, fallen) else _OPEN
         kept.append(Confirmed(claim, finding, grounds, most))
@@ -98,7 +98,7 @@ def doubted(
             replaceable=_encompassed(claim, [*others, *nuisance], bench, doubts),
         )
         # No held-out session confirms a change between sessions, and a dependence on the motion is similar to one.
-        like = one.finding.mode == "between" and bool(unnamed & mine)
+        like = claim.trial.passing and bool(unnamed & mine)
         open_ = like or grounds.replaceable > _REPLACEABLE or _bent(claim, remainders)
         most = min(one.most, claim.confidence, _OPEN if open_ else 1.0)
         findings.append(
@@ -157,10 +157,10 @@ def confirmed_delay(
     return replace(finding, confidence=confidence, grounds=grounds.to_dict())
 
 
-def _untested(claim: Claim, finding: Finding) -> bool:
+def _untested(claim: Claim) -> bool:
     """Whether held-out sessions say nothing: of a change between sessions, a brief event, or what samples show."""
-    effect = claim.trial.candidate.effect
-    return finding.mode == "between" or effect.repeats or effect.seen_in_samples(claim.trial.shape)
+    trial, effect = claim.trial, claim.trial.candidate.effect
+    return trial.passing or effect.repeats or effect.seen_in_samples(trial.shape)
 
 
 def _refuted(
@@ -173,7 +173,7 @@ def _refuted(
     fitted, or almost confirmed by the others, may be this one or another, if what it takes off their error is felt.
     """
     low, high = fallen
-    if _untested(claim, finding) or low > 0.0:
+    if _untested(claim) or low > 0.0:
         return False
     if hardly and high > -_ALL_BUT * claim.gain:
         return False
@@ -199,7 +199,7 @@ def _plain(
         return False
     if claim.trial.candidate.effect.repeats:
         return _power(claim, bench) > FELT_POWER
-    if _untested(claim, finding):
+    if _untested(claim):
         return True
     return _seen(fallen[0], grounds)
 

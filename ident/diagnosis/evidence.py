@@ -376,6 +376,12 @@ class Evidence:
 
         return Score(gain, fitted, coefficients, gain / max(rows, 1.0), robust)
 
+    def fitted(self, products: Products, on: Floats) -> Floats:
+        """Fall (m,) of the chi-square on the fitted rows by columns in m choices of the blocks, `on` (m, blocks)."""
+        base, own, target = block_sums(on, products.base), block_sums(on, products.own), on @ products.target
+        _, inner, moment, _ = schur((base, own, target), self.full, 0.0)
+        return np.asarray(np.einsum("mk,mkl,ml->m", moment, inner, moment))
+
     def event_score(self, score: Score, choices: int) -> Score:
         """Score of columns active in a few blocks, the best of `choices`: the fall on the fitted rows less its
         expectation for the best of so many by chance."""

@@ -307,7 +307,7 @@ class State:
             key = trial.candidate.key
             if shapes[key] == _SHAPES or (key not in shapes and len(shapes) == _MOST_HABITS):
                 continue
-            single = len(trial.score.coefficients) == 1 and not trial.candidate.effect.event
+            single = len(trial.score.coefficients) == 1 and not trial.candidate.effect.timed(trial.shape)
             if single and not self.carried(trial) and self.carried(trial, healthy=False):
                 log.info("%s: gain %.0f, as on healthy days", trial.candidate.key, trial.score.gain)
                 name = f"{HABIT} {len(known) + 1}: {trial.candidate.cause} {trial.candidate.joint + 1}"
@@ -380,7 +380,7 @@ class State:
 
     def choices(self, trial: Trial) -> int:
         """Number of shapes in the choice of an event."""
-        return self.evidence.blocks if trial.candidate.effect.event else 1
+        return self.evidence.blocks if trial.candidate.effect.timed(trial.shape) else 1
 
     def carried(self, trial: Trial, score: Score | None = None, *, healthy: bool = True) -> bool:
         """Whether the evidence for the trial suffices: gain, significance, and size. healthy : False asks for no more
@@ -568,7 +568,7 @@ class State:
         if twin is not None:
             sure, alike = min(sure, _EITHER), (*alike, (twin, _gain(again)))
         # Of many times tried, one always fits to some degree.
-        lasting = (t for t in close if not t.candidate.effect.event)
+        lasting = (t for t in close if not t.candidate.effect.timed(t.shape))
         outdone = any(_gain(t) > _gain(again) and not self.carried(t) for t in lasting)
         changed_alone = again.score.gain <= self.null.limit(again)
         return Claim(again, again.score, alike, sure, outdone, changed_alone)

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ident.effects.course import TIME_CONSTANT, Course, Drifting
+from ident.effects.course import MOMENT, TIME_CONSTANT, Course, Drifting
 from ident.effects.drive import ScaleError
 from ident.effects.effect import (
     Column,
@@ -209,14 +209,16 @@ class SensorOffsetDrift(Drifting):
     cause = "sensor_offset_drift"
     side = "sensor"
     summary = "the zero of a sensor moves"
-    physics = "the strain gauges' zero moves with temperature"
+    physics = "the strain gauges' zero moves with temperature, and jumps by an overload or a loose contact"
     source = "Hirzinger et al., ICRA 2002"
     parameters = (
         Parameter("drift", "Nm", "change of the zero"),
         Parameter("zero", "Nm", "of all sessions, against the reference"),
         *TIME_CONSTANT,
+        *MOMENT,
     )
     courses = (Course.WITHIN,)
+    onsets = (Course.STEP_WITHIN, Course.STEP_UNDONE)
     law = Law("time")
     confused_with = ("payload_change", "joint_zero_offset")
     experiment = Discriminator.HOT_AND_COLD

@@ -1,4 +1,4 @@
-"""The course of a drift: within each session, from one session to the next, or since the reference.
+"""The course of a drift: within each session, at a moment of one, from one session to the next, or since the reference.
 
 Between two sessions a zero moves, or a drive cools down, by an unknown amount. Compared with a reference each session
 then has a value of its own: a level of the first ones and a step to the later ones. One number for all of them would
@@ -27,6 +27,10 @@ TIME_CONSTANT = (
         fixed=True,
     ),
 )
+MOMENT = (
+    Parameter("time", "s", "of a step, from the start of its session", shape=True),
+    Parameter("session", "1", "number of the session of the step", shape=True, fixed=True),
+)
 # Time constants to begin with, over the longest session: from a part of it to a steady drift.
 _SHARES = (0.15, 0.4, 1.0, 5.0)
 # Time constants of a heat that outlasts the pause between sessions [s].
@@ -36,7 +40,7 @@ _LASTING_S = (300.0, 1200.0, 5000.0)
 class Course(Form):
     """How a value drifts: as 1 - exp(-t / time_constant) in each session; with the heat of the drive's friction in its
     place; with that heat carried over from session to session; from session `since` on, without and with a level of the
-    sessions before it; in all sessions.
+    sessions before it; in all sessions; from a moment of a session on, for good and until the end of that session.
     """
 
     WITHIN = "within a session", "change", "drift", "time_constant"
@@ -45,6 +49,8 @@ class Course(Form):
     STEP = "between sessions", "change", "drift", "since"
     LEVEL_AND_STEP = "level, and step between sessions", "change", "level", "drift", "zero", "since"
     SINCE_REFERENCE = "since the reference", "change", "drift"
+    STEP_WITHIN = "step within a session", "drift", "time", "session"
+    STEP_UNDONE = "step within a session, undone after it", "drift", "time", "session"
 
 
 class Drifting(Effect):
@@ -76,14 +82,18 @@ class Drifting(Effect):
         ]
 
     @property
-    def known_forms(self) -> tuple[Course, ...]:
-        """Those within a session, and all between sessions."""
-        return (*self.courses, Course.STEP, Course.LEVEL_AND_STEP, Course.SINCE_REFERENCE)
+    def known_forms(self) -> tuple[Form, ...]:
+        """Those within a session, all between sessions, and those at a moment."""
+        return (*self.courses, Course.STEP, Course.LEVEL_AND_STEP, Course.SINCE_REFERENCE, *self.onsets)
 
     def mode(self, shape: Shape) -> Literal["within", "between"]:
         """Within a session or between sessions."""
         lasting = shape.form in (Course.STEP, Course.LEVEL_AND_STEP, Course.SINCE_REFERENCE)
         return "between" if lasting else "within"
+
+    def passing(self, shape: Shape) -> bool:
+        """Between sessions, or at a moment of one."""
+        return super().passing(shape) or shape.form in self.onsets
 
     def course(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Floats, ...]:
         """Factor (N,) of each coefficient."""
@@ -97,14 +107,24 @@ class Drifting(Effect):
         whole = np.ones(len(motion.time))
         if shape.form is Course.SINCE_REFERENCE:
             return (whole,)
+        if shape.form in self.onsets:
+            later = motion.session + 1 - round(shape["session"])
+            if later == 0:
+                return (np.where(motion.time >= shape["time"], 1.0, 0.0),)
+            return (float(later > 0 and shape.form is Course.STEP_WITHIN) * whole,)
         step = float(motion.session + 1 >= round(shape.get("since", 2.0))) * whole
         return (step, whole) if shape.form is Course.LEVEL_AND_STEP else (step,)
 
     def in_session(self, parameters: Parameters, form: FormName, number: int | None) -> Parameters:
-        """Without the step in the sessions before it."""
-        between = self.form_of(form) in (Course.STEP, Course.LEVEL_AND_STEP)
+        """Without the step in the sessions before it, and from the start in those after it."""
+        course, change = self.form_of(form), self.linear[0].name
+        between = course in (Course.STEP, Course.LEVEL_AND_STEP)
         if between and number is not None and number + 1 < parameters.get("since", 2.0):
-            return {**parameters, self.linear[0].name: 0.0}
+            return {**parameters, change: 0.0}
+        if course in self.onsets and (number is None or number + 1 != round(parameters["session"])):
+            before = number is not None and number + 1 < parameters["session"]
+            gone = before or course is Course.STEP_UNDONE
+            return {**parameters, "time": 0.0, **({change: 0.0} if gone else {})}
         return parameters
 
     def drift(self, parameters: Parameters, form: FormName, time_s: float) -> float:
@@ -112,6 +132,8 @@ class Drifting(Effect):
         change, level = self.coefficients_of(parameters)
         if self.form_of(form) is Course.WITHIN:
             change *= 1.0 - np.exp(-time_s / parameters["time_constant"])
+        if self.form_of(form) in self.onsets:
+            change *= float(time_s >= parameters["time"])
         return float(change + level)
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
@@ -122,6 +144,9 @@ class Drifting(Effect):
             return [f"{size} from session {values['since'][0]:.0f} on"]
         if form is Course.SINCE_REFERENCE:
             return [f"{size} against the reference"]
+        if form in self.onsets:
+            step = f"{size} at {quantity(values['time'])} of session {values['session'][0]:.0f}"
+            return [step, *(["undone after it"] if form is Course.STEP_UNDONE else [])]
         when = "while a session lasts" if form is Course.WITHIN else "with the heat of its own friction"
         when += ", kept from session to session" if form is Course.CARRIED else ""
         return [f"{size} {when}, with a time constant of {quantity(values['time_constant'])}"]

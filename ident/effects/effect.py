@@ -273,7 +273,8 @@ class Effect(ABC):
     depends_on : the independent variable of its torque.
     law : the variable of its law, for the model-form error; None if unknown.
     whole_arm : the effect belongs to no single joint. event : it acts during a part of the time only, found by a
-        search over times. step : it sets in at its `time` and stays. displaces : it turns the link under load.
+        search over times. onsets : forms that set in at their `time` in a `session`, found by a search over times, and
+        stay. displaces : it turns the link under load.
     remembers : its torque may follow from the motion more than seconds ago.
     channel : the torque channel it delays. counted : seen by counting samples, without a torque of its own.
     hidden : linear parameters equal to 1 by the physics, free in the search and not reported.
@@ -303,7 +304,7 @@ class Effect(ABC):
     whole_arm: ClassVar[bool] = False
     event: ClassVar[bool] = False
     remembers: ClassVar[bool] = True
-    step: ClassVar[bool] = False
+    onsets: ClassVar[tuple[Form, ...]] = ()
     displaces: ClassVar[bool] = False
     channel: ClassVar[Literal["motor", "joint"] | None] = None
     counted: ClassVar[bool] = False
@@ -357,7 +358,15 @@ class Effect(ABC):
     @property
     def repeats(self) -> bool:
         """Whether it may be claimed several times, like a contact and unlike a lasting change."""
-        return self.event and not self.step
+        return self.event and not self.onsets
+
+    def timed(self, shape: Shape) -> bool:
+        """Whether the time of a shape is the best one of a search."""
+        return self.event or shape.form in self.onsets
+
+    def passing(self, shape: Shape) -> bool:
+        """Whether it is a change between these sessions, or at a moment of one, with no value in a further one."""
+        return self.mode(shape) == "between"
 
     @property
     def linear(self) -> tuple[Parameter, ...]:

@@ -320,6 +320,28 @@ def test_zero_of_each_session_is_no_function_of_the_angle(
     assert found.parameters["zero"].value == pytest.approx(-0.12, abs=0.02)
 
 
+@pytest.mark.parametrize("undone", [False, True])
+def test_zero_that_jumps_within_a_session_is_told_with_its_moment(
+    make: Make, chain: Chain, reference: Reference, undone: bool
+) -> None:
+    def jumps(s: Signals) -> None:
+        s["joint"][s["time"] >= 7.3, 1] += 0.15
+
+    def stays(s: Signals) -> None:
+        s["joint"][:, 1] += 0.0 if undone else 0.15
+
+    sessions = [make("a.mcap", 5, jumps), make("b.mcap", 6, stays, 1)]
+    found = diagnose(sessions, chain, reference=reference)
+    (claim,) = found.claims
+    assert (claim.cause, claim.joints, claim.mode) == ("sensor_offset_drift", (2,), "within")
+    assert claim.form == f"step within a session{', undone after it' if undone else ''}"
+    assert claim.parameters["drift"].value == pytest.approx(0.15, abs=0.02)
+    assert claim.parameters["time"].value == pytest.approx(7.3, abs=0.3)
+    assert claim.parameters["session"].value == 1
+    # A moment of a session has no place in a model of the arm.
+    assert not found.extended_model.effects
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "turns", "phase", "commissioned"),

@@ -88,7 +88,9 @@ def setting() -> Setting:
 
 
 def shapes(cause: str) -> list[Shape]:
-    return [*EFFECTS[cause].shapes(setting(), 1)] or ([Shape(**CONTACT)] if cause == "contact" else [Shape()])
+    effect = EFFECTS[cause]
+    timed = [Shape(form, time=0.3, session=1) for form in effect.onsets]
+    return [*effect.shapes(setting(), 1), *timed] or [Shape(**CONTACT) if cause == "contact" else Shape()]
 
 
 def test_causes_and_sides_are_those_of_the_table() -> None:

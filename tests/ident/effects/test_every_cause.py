@@ -115,7 +115,7 @@ def stated(effect: Effect, form: Form | None, motion: ArmMotion) -> dict[str, fl
     for_all = [*effect.shapes(setting(motion), JOINT), *effect.shapes(setting(motion, "link"), JOINT)]
     shapes = [shape for shape in for_all if shape.form is form]
     shape: dict[str, float] = dict(shapes[0]) if shapes else {"since": 2.0}
-    shape |= {"time": 1.5, "duration": 1.0, "session": 2.0, "link": 7.0} if effect.event else {}
+    shape |= {"time": 1.5, "duration": 1.0, "session": 2.0, "link": 7.0} if effect.event or form in effect.onsets else {}
     shape |= {"delay": 0.015} if effect.channel else {}
     # Crossed over so much torque, a gap passes the filter of its twist.
     shape |= {"width": 8.0} if effect.cause == "backlash" else {}
@@ -210,7 +210,7 @@ def test_the_derivative_is_the_slope_of_the_torque(
 ) -> None:
     values = stated(effect, form, motion)
     # What sets in at a time moves by whole samples.
-    shape = () if effect.step else effect.continuous(effect.shape_of(values, form))
+    shape = () if form in effect.onsets else effect.continuous(effect.shape_of(values, form))
     smooth = {*(p.name for p in effect.linear), *shape} & set(values)
     for name in smooth:
         step = 1e-4 * max(abs(values[name]), 1e-3)
