@@ -212,7 +212,7 @@ class Dictionary:
             for joint in ([-1] if EFFECTS[cause].whole_arm else np.flatnonzero(nominal.moving).tolist())
         )
         self._kept: dict[tuple[str, int], list[_Entry]] = {}
-        self._whole: dict[tuple[str, int, int], _Entry] = {}
+        self._whole: dict[tuple[str, int, int], _Entry | None] = {}
         self._information: dict[tuple[str, int], dict[str, float]] = {}
         self._arena = Arena()
 
@@ -256,7 +256,7 @@ class Dictionary:
         """The best edge of a block for the forms that set in at a time. Products after an edge are a part of their
         blocks, so those of the whole session are made once."""
         evidence = self.evidence
-        best: tuple[Shape, Score, tuple[str, int, int]] | None = None
+        best: tuple[Shape, Score, Rows] | None = None
         sessions = sorted(set(evidence.block_session.tolist()))
         for number, (form, session) in enumerate(product(candidate.effect.onsets, sessions)):
             mine = np.flatnonzero(evidence.block_session == session)
@@ -270,10 +270,12 @@ class Dictionary:
             shape = Shape(form, time=starts.min() - 1.0, session=session + 1)
             key = (*candidate.key, number)
             if key not in self._whole:
-                self._whole[key] = self._entry(shape, self.rows(candidate, shape))
-            _, rows, known = self._whole[key]
-            if not _acts(rows):
+                made = self.rows(candidate, shape)
+                self._whole[key] = self._entry(shape, made) if _acts(made) else None
+            entry = self._whole[key]
+            if entry is None:
                 continue
+            _, rows, known = entry
             whole = evidence.products(partial(evidence.padded, rows), known)
             on = np.ones((len(edges), evidence.blocks))
             on[:, mine] = starts >= edges[:, None]
@@ -282,12 +284,12 @@ class Dictionary:
             at = shape.at(time=edges[top])
             score = self._timed(candidate, at, score, evidence.blocks)
             if best is None or score.gain > best[1].gain:
-                best = (at, score, key)
+                best = (at, score, rows)
         if best is None or not candidate.effect.plausible(best[1].coefficients, best[0]):
             return None
         # The rows themselves are made only for a step with enough gain.
-        shape, score, key = best
-        rows = self._whole[key][1] if score.gain < _WORTH_ROWS else self.rows(candidate, shape)
+        shape, score, rows = best
+        rows = rows if score.gain < _WORTH_ROWS else self.rows(candidate, shape)
         return Trial(candidate, shape, score, rows)
 
     def _grid(self, candidate: Candidate) -> Sequence[Shape]:

@@ -65,8 +65,8 @@ class Products:
 
 
 def width_of(rows: Rows) -> int:
-    """Number of columns."""
-    return next(iter(rows.values())).shape[1]
+    """Number of columns, 0 without rows."""
+    return next((columns.shape[1] for columns in rows.values()), 0)
 
 
 def inverse_of(gram: Floats, scale: Floats) -> Floats:

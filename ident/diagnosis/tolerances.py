@@ -95,7 +95,7 @@ def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSe
                 )
     if evidence.compared:
         # Without a reference the gains of the sensors are hardly distinguishable from a scale of all masses.
-        size = HABITUAL * nominal.arm.gain_std
+        size = HABITUAL * _FURTHER * nominal.arm.gain_std
         found += [
             Tolerance(f"{GAIN} {j + 1}", rows, 1.0, size, (SENSOR_GAIN.cause, j))
             for j, rows in gain_rows(dictionary).items()
@@ -155,8 +155,8 @@ def _usual_share(entry: Mapping[str, Any], effect: Effect) -> float:
 
 
 def usual_change(effect: Effect, arm: NominalArm) -> float:
-    """Standard deviation from day to day of a cause that is a scale, 0 for others."""
-    return max(effect.usual_change, arm.gain_std) if effect.usual_change else 0.0
+    """Standard deviation of a cause that is a scale on a further day from its healthy mean, 0 for others."""
+    return _FURTHER * max(effect.usual_change, arm.gain_std) if effect.usual_change else 0.0
 
 
 def gain_rows(dictionary: Dictionary) -> dict[int, Rows]:

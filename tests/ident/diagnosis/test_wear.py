@@ -206,7 +206,7 @@ def test_a_gain_beyond_the_usual_is_told_with_its_own_size(
     make: Make, chain: Chain, reference: Reference
 ) -> None:
     # Half of it would be a usual gain of another day.
-    true = 4.5 * reference.gain_std
+    true = 5.5 * reference.gain_std
 
     def scaled(s: Signals) -> None:
         s["joint"][:, 1] *= 1.0 + true

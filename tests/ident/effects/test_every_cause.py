@@ -115,7 +115,11 @@ def stated(effect: Effect, form: Form | None, motion: ArmMotion) -> dict[str, fl
     for_all = [*effect.shapes(setting(motion), JOINT), *effect.shapes(setting(motion, "link"), JOINT)]
     shapes = [shape for shape in for_all if shape.form is form]
     shape: dict[str, float] = dict(shapes[0]) if shapes else {"since": 2.0}
-    shape |= {"time": 1.5, "duration": 1.0, "session": 2.0, "link": 7.0} if effect.event or form in effect.onsets else {}
+    shape |= (
+        {"time": 1.5, "duration": 1.0, "session": 2.0, "link": 7.0}
+        if effect.event or form in effect.onsets
+        else {}
+    )
     shape |= {"delay": 0.015} if effect.channel else {}
     # Crossed over so much torque, a gap passes the filter of its twist.
     shape |= {"width": 8.0} if effect.cause == "backlash" else {}
