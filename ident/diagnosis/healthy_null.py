@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from ident.diagnosis.candidates import Candidate, Dictionary, Trial
@@ -14,6 +16,21 @@ from ident.effects import Shape
 # Least and largest ratio of the information to that of the healthy sets: less of it makes no limit smaller, for what
 # the model lacks differs from motion to motion, too.
 _INFORMATION = (1.0, 25.0)
+
+
+def _counterpart(shape: str, here: Iterable[str], there: Iterable[str]) -> str:
+    """The shape in the grid of other sessions in the place of one in these, of the same form; itself without one.
+
+    Times and torques of a grid are shares of the sessions' own.
+    """
+
+    def alike(table: Iterable[str]) -> list[str]:
+        return [one for one in table if one.partition("=")[0] == shape.partition("=")[0]]
+
+    mine, others = alike(here), alike(there)
+    if shape in others or shape not in mine or len(mine) != len(others):
+        return shape
+    return others[mine.index(shape)]
 
 
 class HealthyNull:
@@ -54,10 +71,11 @@ class HealthyNull:
         Few healthy days may be alike by chance, so it is no less than that of the usual change of a scale.
         """
         least = self._scaled(candidate)
-        before = self.healthy.shown.get(candidate.key, {}).get(shape, 0.0)
+        shown, here = self.healthy.shown.get(candidate.key, {}), self.dictionary.information(candidate)
+        before = shown.get(_counterpart(shape, here, shown), 0.0)
         if not limit or before <= 0.0:
             return max(limit, least)
-        now = self.dictionary.information(candidate).get(shape, 0.0)
+        now = here.get(shape, 0.0)
         return max(limit * float(np.clip(now / before, *_INFORMATION)), least)
 
     def _scaled(self, candidate: Candidate) -> float:

@@ -212,12 +212,12 @@ class SensorOffsetDrift(Drifting):
     physics = "the strain gauges' zero moves with temperature, and jumps by an overload or a loose contact"
     source = "Hirzinger et al., ICRA 2002"
     parameters = (
-        Parameter("drift", "Nm", "change of the zero"),
+        Parameter("drift", "Nm", "change of the zero; of a steady one, in a minute"),
         Parameter("zero", "Nm", "of all sessions, against the reference"),
         *TIME_CONSTANT,
         *MOMENT,
     )
-    courses = (Course.WITHIN,)
+    courses = (Course.WITHIN, Course.STEADY)
     onsets = (Course.STEP_WITHIN, Course.STEP_UNDONE)
     law = Law("time")
     confused_with = ("payload_change", "joint_zero_offset")

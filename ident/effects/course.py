@@ -31,19 +31,22 @@ MOMENT = (
     Parameter("time", "s", "of a step, from the start of its session", shape=True),
     Parameter("session", "1", "number of the session of the step", shape=True, fixed=True),
 )
-# Time constants to begin with, over the longest session: from a part of it to a steady drift.
-_SHARES = (0.15, 0.4, 1.0, 5.0)
+# Time constants to begin with, over the longest session: from a part of it on, and that of a steady drift.
+_SHARES, _STEADY = (0.15, 0.4, 1.0), 5.0
+_MINUTE_S = 60.0
 # Time constants of a heat that outlasts the pause between sessions [s].
 _LASTING_S = (300.0, 1200.0, 5000.0)
 
 
 class Course(Form):
-    """How a value drifts: as 1 - exp(-t / time_constant) in each session; with the heat of the drive's friction in its
-    place; with that heat carried over from session to session; from session `since` on, without and with a level of the
-    sessions before it; in all sessions; from a moment of a session on, for good and until the end of that session.
+    """How a value drifts: as 1 - exp(-t / time_constant) in each session; steadily, by so much a minute; with the
+    heat of the drive's friction in its place; with that heat carried over from session to session; from session
+    `since` on, without and with a level of the sessions before it; in all sessions; from a moment of a session on,
+    for good and until the end of that session.
     """
 
     WITHIN = "within a session", "change", "drift", "time_constant"
+    STEADY = "steadily within a session", "drift"
     HEATED = "heated by friction", "change", "time_constant"
     CARRIED = "heat carried over", "change", "time_constant"
     STEP = "between sessions", "change", "drift", "since"
@@ -67,16 +70,18 @@ class Drifting(Effect):
         """From a fifth of the session to a steady drift, and between sessions if there are several."""
         longest = max(setting.durations_s)
         step = Course.LEVEL_AND_STEP if setting.compared else Course.STEP
+        shares = _SHARES if Course.STEADY in self.courses else (*_SHARES, _STEADY)
+        times: dict[Course, Sequence[float]] = {
+            Course.STEADY: (),
+            Course.CARRIED: _LASTING_S if setting.pauses else (),
+        }
         return [
             *(
                 Shape(form, time_constant=time)
                 for form in self.courses
-                for time in (
-                    (share * longest for share in _SHARES)
-                    if form is not Course.CARRIED
-                    else (_LASTING_S if setting.pauses else ())
-                )
+                for time in times.get(form, [share * longest for share in shares])
             ),
+            *([Shape(Course.STEADY)] if Course.STEADY in self.courses else []),
             *(Shape(step, since=k) for k in range(2, setting.sessions + 1)),
             Shape(Course.SINCE_REFERENCE),
         ]
@@ -104,6 +109,8 @@ class Drifting(Effect):
             return (motion.along(lambda m: _carried(m, joint, constant), "carried", joint, constant),)
         if shape.form is Course.WITHIN:
             return (1.0 - np.exp(-motion.time / shape["time_constant"]),)
+        if shape.form is Course.STEADY:
+            return (motion.time / _MINUTE_S,)
         whole = np.ones(len(motion.time))
         if shape.form is Course.SINCE_REFERENCE:
             return (whole,)
@@ -132,6 +139,8 @@ class Drifting(Effect):
         change, level = self.coefficients_of(parameters)
         if self.form_of(form) is Course.WITHIN:
             change *= 1.0 - np.exp(-time_s / parameters["time_constant"])
+        if self.form_of(form) is Course.STEADY:
+            change *= time_s / _MINUTE_S
         if self.form_of(form) in self.onsets:
             change *= float(time_s >= parameters["time"])
         return float(change + level)
@@ -144,6 +153,8 @@ class Drifting(Effect):
             return [f"{size} from session {values['since'][0]:.0f} on"]
         if form is Course.SINCE_REFERENCE:
             return [f"{size} against the reference"]
+        if form is Course.STEADY:
+            return [f"{size} a minute while a session lasts"]
         if form in self.onsets:
             step = f"{size} at {quantity(values['time'])} of session {values['session'][0]:.0f}"
             return [step, *(["undone after it"] if form is Course.STEP_UNDONE else [])]
