@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fri.errors import ConfigurationError
 from ident.diagnosis.nominal_arm import GAIN_STD
 from ident.diagnosis.products import Floats
-from ident.diagnosis.usual_sizes import Healthy, UsualSize, scatter_limits
+from ident.diagnosis.usual_sizes import Healthy, UsualSize, independent, scatter_limits
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import LINK_FRICTION, PER_LINK, split_name
 from ident.effects import EFFECTS
@@ -232,9 +232,10 @@ class Reference:
         The gain of a candidate differs between healthy sets, for the arm is never quite the nominal one. It is
         modelled as the square of a normally distributed deviation. Then the gain of a further set over the mean of
         `sets` of them has Fisher's distribution F(1, sets). The mean of a few sets is uncertain, so the mean of the
-        same cause over all joints counts as further sets. Each of the n sets was held against the others; a further one
-        is held against all, and deviates from their mean by 1 - 1/n^2 of that in square. A function of many knots is
-        one deviation, too: what a healthy arm leaves has a form.
+        same cause over all joints counts as further sets, unless all joints have it from one state of a day. Each of
+        the n sets was held against the others; a further one is held against all, and deviates from their mean by
+        1 - 1/n^2 of that in square. A function of many knots is one deviation, too: what a healthy arm leaves has a
+        form.
         """
         if not self.sets:
             return {}
@@ -245,10 +246,10 @@ class Reference:
         # The gain from noise alone has no such tail; the least gain of a claim accounts for it.
         noise = float(np.median(list(self.null.values()))) if self.null else 0.0
         sets = self.sets + _AS_SETS
-        factor = fisher_limit(_ONE_IN, 1, sets) * further
         found = {}
         for key, gain in self.null.items():
             mean = (self.sets * gain + _AS_SETS * float(np.mean(by_cause[key[0]]))) / sets
+            factor = fisher_limit(_ONE_IN, 1, independent(key, self.sets, sets)) * further
             found[key] = noise + factor * max(mean - noise, 0.0)
         # On a healthy arm a cause reaches at least the gain of its special cases, and is not counted beside them.
         for effect in EFFECTS.values():

@@ -16,10 +16,13 @@ from fri.errors import ConfigurationError
 from ident.diagnosis.candidates import Dictionary
 from ident.diagnosis.products import Floats
 from ident.diagnosis.score import Score
+from ident.effects import EFFECTS
 from ident.estimators.estimate import fisher_limit
 
 # Least square of a size over its variance for a factor between the two.
 _THERE = 9.0
+# Least number of sets for a limit.
+_LEAST_SETS = 2
 # Largest change of a size from day to day as a share of it: three standard deviations of friction's.
 _LARGEST_SHARE = 0.3
 
@@ -138,6 +141,12 @@ def usual_sizes(sets: Sequence[Table]) -> dict[Key, UsualSize]:
     return found
 
 
+def independent(key: Key, own: float, with_joints: float) -> float:
+    """Number of independent sets behind a mean: with those that the other joints count for, unless all joints of an
+    arm have the cause from one state of a day; two at least, since a limit from one is none."""
+    return max(own, _LEAST_SETS) if EFFECTS[key[0]].together else with_joints
+
+
 def scatter_limits(
     sizes: Mapping[Key, UsualSize], sets: int, one_in: float, as_changes: float
 ) -> dict[Key, float]:
@@ -150,9 +159,9 @@ def scatter_limits(
         by_cause.setdefault(cause, []).append(size.scatter)
     noise = float(np.median([size.scatter for size in sizes.values()]))
     changes = sets - 1 + as_changes
-    factor = fisher_limit(one_in, 1, changes) * (1.0 - sets**-2.0)
     found = {}
     for key, size in sizes.items():
         mean = ((sets - 1) * size.scatter + as_changes * float(np.mean(by_cause[key[0]]))) / changes
+        factor = fisher_limit(one_in, 1, independent(key, sets - 1, changes)) * (1.0 - sets**-2.0)
         found[key] = noise + factor * max(mean - noise, 0.0)
     return found

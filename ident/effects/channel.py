@@ -217,6 +217,7 @@ class SensorOffsetDrift(Drifting):
         *TIME_CONSTANT,
         *MOMENT,
     )
+    together = True
     courses = (Course.WITHIN, Course.STEADY)
     onsets = (Course.STEP_WITHIN, Course.STEP_UNDONE)
     law = Law("time")

@@ -154,7 +154,7 @@ class Drifting(Effect):
         if form is Course.SINCE_REFERENCE:
             return [f"{size} against the reference"]
         if form is Course.STEADY:
-            return [f"{size} a minute while a session lasts"]
+            return [f"{size} a minute"]
         if form in self.onsets:
             step = f"{size} at {quantity(values['time'])} of session {values['session'][0]:.0f}"
             return [step, *(["undone after it"] if form is Course.STEP_UNDONE else [])]

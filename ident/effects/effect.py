@@ -278,6 +278,7 @@ class Effect(ABC):
     remembers : its torque may follow from the motion more than seconds ago.
     channel : the torque channel it delays. counted : seen by counting samples, without a torque of its own.
     hidden : linear parameters equal to 1 by the physics, free in the search and not reported.
+    together : in all joints it follows from one state of a day, such as the arm's temperature.
     character : every drive of the kind has it, so it is no fault by itself.
     evidence_factor : multiple of the usual evidence, for a cause the nominal arm itself resembles slightly.
     usual_change : standard deviation of its size from day to day on any arm of the kind. usual_share : the same where
@@ -309,6 +310,7 @@ class Effect(ABC):
     channel: ClassVar[Literal["motor", "joint"] | None] = None
     counted: ClassVar[bool] = False
     hidden: ClassVar[tuple[str, ...]] = ()
+    together: ClassVar[bool] = False
     character: ClassVar[bool] = False
     evidence_factor: ClassVar[float] = 1.0
     usual_change: ClassVar[float] = 0.0
