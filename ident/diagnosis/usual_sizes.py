@@ -16,7 +16,7 @@ from fri.errors import ConfigurationError
 from ident.diagnosis.candidates import Dictionary
 from ident.diagnosis.products import Floats
 from ident.diagnosis.score import Score
-from ident.effects import EFFECTS
+from ident.effects import find_effect
 from ident.estimators.estimate import fisher_limit
 
 # Least square of a size over its variance for a factor between the two.
@@ -144,7 +144,7 @@ def usual_sizes(sets: Sequence[Table]) -> dict[Key, UsualSize]:
 def independent(key: Key, own: float, with_joints: float) -> float:
     """Number of independent sets behind a mean: with those that the other joints count for, unless all joints of an
     arm have the cause from one state of a day; two at least, since a limit from one is none."""
-    return max(own, _LEAST_SETS) if EFFECTS[key[0]].together else with_joints
+    return max(own, _LEAST_SETS) if find_effect(key[0]).together else with_joints
 
 
 def scatter_limits(
