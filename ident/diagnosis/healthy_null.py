@@ -41,14 +41,18 @@ class HealthyNull:
 
     def limit(self, trial: Trial) -> float:
         """Upper limit of the gain of such a trial on a healthy arm."""
-        return self._in_these(
-            trial.candidate, self.healthy.limits.get(trial.candidate.key, 0.0), self.dictionary.nearest(trial)
-        )
+        limit = self.healthy.limits.get(trial.candidate.key, 0.0)
+        return self._in_these(trial.candidate, limit, self.dictionary.nearest(trial), trial.score)
 
     def exceeded(self, trial: Trial) -> bool:
         """Whether a trial is more than on a healthy arm: its difference from the usual size. Its gain alone suffices
         where the healthy sets have no clear size."""
-        candidate, more = trial.candidate, trial.score.gain > self.limit(trial)
+        candidate = trial.candidate
+        if trial.shape.form in candidate.effect.onsets and not candidate.effect.event:
+            # A healthy arm's drift has a gain as a step, too, and a larger one as a drift.
+            alike = [one.gain for one in self.dictionary.scores(candidate).values()]
+            return trial.score.gain - max([0.0, *alike]) > self.least(candidate, trial.score)
+        more = trial.score.gain > self.limit(trial)
         usual = self.healthy.sizes.get(candidate.key)
         here = None if usual is None else self.dictionary.scored(candidate, usual[0].shape)
         if usual is None or here is None:
@@ -57,20 +61,21 @@ class HealthyNull:
         change = size.beyond(here)
         other = trial.score.gain - max(here.gain, 0.0)
         # Days alike by chance have a limit below that of noise.
-        limit = max(self._in_these(candidate, limit, size.shape), self.least(candidate, here))
+        limit = max(self._in_these(candidate, limit, size.shape, here), self.least(candidate, here))
         changed = change > 0.0 and change + other > limit
-        return changed or (more and not size.clear(here, self._in_these(candidate, size.scatter, size.shape)))
+        scatter = self._in_these(candidate, size.scatter, size.shape, here)
+        return changed or (more and not size.clear(here, scatter))
 
     def least(self, candidate: Candidate, score: Score) -> float:
         """Least gain of a claim."""
         return self.settings.least_of_claim(candidate.effect.evidence_factor, len(score.coefficients))
 
-    def _in_these(self, candidate: Candidate, limit: float, shape: str) -> float:
-        """A limit in the healthy sets, in sessions with as much information on a candidate of a shape.
+    def _in_these(self, candidate: Candidate, limit: float, shape: str, score: Score) -> float:
+        """A limit in the healthy sets for a score, in sessions with as much information on a candidate of a shape.
 
         Few healthy days may be alike by chance, so it is no less than that of the usual change of a scale.
         """
-        least = self._scaled(candidate)
+        least = self._scaled(candidate, score)
         shown, here = self.healthy.shown.get(candidate.key, {}), self.dictionary.information(candidate)
         before = shown.get(_counterpart(shape, here, shown), 0.0)
         if not limit or before <= 0.0:
@@ -78,10 +83,13 @@ class HealthyNull:
         now = here.get(shape, 0.0)
         return max(limit * float(np.clip(now / before, *_INFORMATION)), least)
 
-    def _scaled(self, candidate: Candidate) -> float:
+    def _scaled(self, candidate: Candidate, score: Score) -> float:
         """Gain by the largest usual change from day to day of a cause that is a scale, 0 for others and without a
-        reference."""
+        reference: as much as the score's own size tells beside the present columns."""
         if not candidate.effect.usual_change or not self.healthy.limits:
             return 0.0
         largest = HABITUAL * usual_change(candidate.effect, self.dictionary.nominal.arm)
+        size = float(np.abs(score.coefficients[0])) if len(score.coefficients) == 1 else 0.0
+        if size > 0.0:
+            return score.gain * (largest / size) ** 2
         return self.dictionary.information(candidate).get(repr(Shape()), 0.0) * largest**2
