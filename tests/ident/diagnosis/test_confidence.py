@@ -12,12 +12,12 @@ from ident.diagnosis.candidates import _scan
 from ident.diagnosis.confidence import LIMITS, SIGNS, Grounds, believable, probability, scaled
 
 USUAL = Grounds(
-    gain=2.0,
+    gain=3.0,
     significance=8.0,
     rivals=4.0,
-    held_out=2.0,
+    held_out=2.5,
     untested=0.0,
-    felt=0.1,
+    felt=0.15,
     one_block=0.0,
     worse=0.0,
     rest=0.2,
@@ -50,7 +50,7 @@ def test_a_finding_is_told_if_one_of_its_causes_is_more_likely_right_than_none()
     assert believable(plain.to_dict())
     assert not believable(replace(plain, gain=0.0, significance=3.0, felt=0.0).to_dict())
     # Even odds between two names are no doubt about both.
-    between = replace(plain, rivals=-1.0, company=2.0)
+    between = replace(plain, rivals=-1.0)
     assert probability(between) < 0.5 < probability(replace(between, rivals=6.0))
     assert believable(between.to_dict())
 

@@ -210,7 +210,7 @@ def test_what_shows_faintly_is_unsure_and_named_only_where_held_out_sessions_bea
 ) -> None:
     def faint(s: Signals) -> None:
         v = s["qd"][:, 1]
-        s["motor"][:, 1] += 0.06 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
+        s["motor"][:, 1] += 0.13 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
 
     fitted, held = pair(make, faint, seed=5), [make(f"{k}.mcap", k, faint, k) for k in (10, 11, 12)]
     (found,) = diagnose(fitted, chain, test=held, reference=reference).claims
