@@ -320,6 +320,20 @@ def test_zero_of_each_session_is_no_function_of_the_angle(
     assert found.parameters["zero"].value == pytest.approx(-0.12, abs=0.02)
 
 
+def test_zero_that_drifts_steadily_is_told_by_its_rate(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def creeps(s: Signals) -> None:
+        s["joint"][:, 1] += 0.6 * s["time"] / 60.0
+
+    (found,) = diagnose(pair(make, creeps, seed=5), chain, reference=reference).claims
+    assert (found.cause, found.joints) == ("sensor_offset_drift", (2,))
+    assert found.form == "steadily within a session"
+    drift = found.parameters["drift"]
+    assert drift.value == pytest.approx(0.6, abs=3.0 * drift.std)
+    assert drift.std < 0.06
+
+
 @pytest.mark.parametrize("undone", [False, True])
 def test_zero_that_jumps_within_a_session_is_told_with_its_moment(
     make: Make, chain: Chain, reference: Reference, undone: bool

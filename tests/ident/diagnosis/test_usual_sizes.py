@@ -113,6 +113,28 @@ def test_limits_of_scatter_lean_on_the_other_joints() -> None:
     assert many["stribeck", 1] < limits["stribeck", 1]
 
 
+def test_sensors_that_drift_together_are_one_observation_of_a_day() -> None:
+    def largest(cause: str) -> float:
+        sizes = {
+            (cause, j): UsualSize("v", np.ones(1), scatter) for j, scatter in enumerate((40.0, 1.0, 1.0))
+        }
+        return scatter_limits(sizes, 2, 0.01, 4)[cause, 0]
+
+    assert largest("sensor_offset_drift") > 3.0 * largest("stribeck")
+
+
+def test_a_limit_grows_with_what_unlike_sessions_show() -> None:
+    short, long = (f"Shape(within a session, time_constant={time})" for time in (8.0, 16.0))
+    trial = Trial(Candidate(EFFECTS["sensor_offset_drift"], 0), Shape(), score(1.0), {})
+    dictionary = SimpleNamespace(information=lambda _: {long: 8.0}, nearest=lambda _: long)
+    null = HealthyNull(
+        dictionary,  # type: ignore[arg-type]
+        DiagnosisSettings(),
+        Healthy({trial.candidate.key: 10.0}, {trial.candidate.key: {short: 2.0}}),
+    )
+    assert null.limit(trial) == pytest.approx(40.0)
+
+
 def test_a_usual_size_is_read_as_it_was_written() -> None:
     size = UsualSize("Shape(velocity=0.05)", np.array([1.25, -3e-7]), 12.34)
     again = UsualSize.read(size.stored())
