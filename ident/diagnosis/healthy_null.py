@@ -33,6 +33,12 @@ def _counterpart(shape: str, here: Iterable[str], there: Iterable[str]) -> str:
     return others[mine.index(shape)]
 
 
+def _is_step(trial: Trial) -> bool:
+    """Whether a trial is a step of what may drift as well."""
+    effect = trial.candidate.effect
+    return trial.shape.form in effect.onsets and not effect.event
+
+
 class HealthyNull:
     """The gains of candidates that a healthy arm reaches in the present sessions."""
 
@@ -40,18 +46,21 @@ class HealthyNull:
         self.dictionary, self.settings, self.healthy = dictionary, settings, healthy
 
     def limit(self, trial: Trial) -> float:
-        """Upper limit of the gain of such a trial on a healthy arm."""
+        """Upper limit of the gain of such a trial on a healthy arm; 0 for a step, see `exceeded`."""
+        if _is_step(trial):
+            return 0.0
         limit = self.healthy.limits.get(trial.candidate.key, 0.0)
         return self._in_these(trial.candidate, limit, self.dictionary.nearest(trial), trial.score)
 
     def exceeded(self, trial: Trial) -> bool:
         """Whether a trial is more than on a healthy arm: its difference from the usual size. Its gain alone suffices
-        where the healthy sets have no clear size."""
+        where the healthy sets have no clear size. A step has to be more than a drift in its place: that of a healthy
+        arm has a gain as a step, too.
+        """
         candidate = trial.candidate
-        if trial.shape.form in candidate.effect.onsets and not candidate.effect.event:
-            # A healthy arm's drift has a gain as a step, too, and a larger one as a drift.
-            alike = [one.gain for one in self.dictionary.scores(candidate).values()]
-            return trial.score.gain - max([0.0, *alike]) > self.least(candidate, trial.score)
+        if _is_step(trial):
+            drifts = [one.gain for one in self.dictionary.scores(candidate).values()]
+            return trial.score.gain - max([0.0, *drifts]) > self.least(candidate, trial.score)
         more = trial.score.gain > self.limit(trial)
         usual = self.healthy.sizes.get(candidate.key)
         here = None if usual is None else self.dictionary.scored(candidate, usual[0].shape)
