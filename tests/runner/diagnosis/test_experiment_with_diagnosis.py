@@ -279,7 +279,7 @@ def test_decide_runs_the_motions_and_names_the_hidden_cause(
 
 @pytest.mark.long
 def test_with_a_healthy_arm_its_character_becomes_a_finding(tmp_path: Path) -> None:
-    parameters = {"amplitude": 1.0, "velocity": 0.08, "exponent": 1.0}
+    parameters = {"amplitude": 1.6, "velocity": 0.08, "exponent": 1.0}
     options = {"cause": "stribeck", "joint": 4, "parameters": parameters}
     hidden = {"type": "sim_backend.model_arm:Cause", "options": options}
     sets = record_sets(Experiment.load(experiment_file(tmp_path, [])), tmp_path / "sets", 3, assume_yes=True)
