@@ -186,7 +186,8 @@ def main(campaigns: tuple[Path, ...], write: bool, check: tuple[Path, ...], diag
 
 
 def _fit(said: Sequence[Said], write: bool) -> None:
-    said = [one for one in said if one.grounds]
+    # Without a healthy arm findings have weights of their own.
+    said = [one for one in said if one.grounds and not one.grounds.get("alone")]
     if not said:
         raise click.ClickException("no finding with grounds in these campaigns; diagnose their cases again")
     points = np.array([stored.scaled(one.grounds) for one in said])

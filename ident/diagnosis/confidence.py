@@ -20,6 +20,9 @@ from fri.errors import ConfigurationError
 from lwr_driver.yaml_text import yaml_content
 
 WEIGHTS = "confidence.yaml"
+"""Of findings against a healthy arm."""
+ALONE = "confidence_alone.yaml"
+"""Of those without one: fitted to arms of two simulations alone, which real arms without a reference bear out."""
 
 HARDLY = 0.5
 """Least probability of a finding: more likely right than wrong."""
@@ -36,7 +39,8 @@ class Grounds:
     felt : share of the held-out error of its rows that the claim takes away. one_block : 1 if one block shows all of
     it. worse : 1 if a row becomes worse beyond chance, see `held_out.worse_rows`. rest : unexplained gain in its rows
     over its own. replaceable : share of its gain explained by unnamed functions of the motion. habitual : 1 for a cause
-    that healthy drives have. company : number of claims of more gain.
+    that healthy drives have. company : number of claims of more gain. alone : 1 without a healthy arm, with weights
+    of its own.
     """
 
     gain: float
@@ -51,6 +55,7 @@ class Grounds:
     replaceable: float = 0.0
     habitual: float = 0.0
     company: float = 0.0
+    alone: float = 0.0
 
     def to_dict(self) -> dict[str, float]:
         """Plain content."""
@@ -123,15 +128,15 @@ def believable(grounds: Mapping[str, float]) -> bool:
 
 def probability(grounds: Grounds) -> float:
     """Probability of a finding with these grounds to be right."""
-    intercept, weights = _fitted()
+    intercept, weights = _fitted(ALONE if grounds.alone else WEIGHTS)
     odds = intercept + float(weights @ scaled(asdict(grounds)))
     return 1.0 / (1.0 + math.exp(-odds))
 
 
 @cache
-def _fitted() -> tuple[float, np.ndarray[Any, np.dtype[np.float64]]]:
-    text = (resources.files("ident.diagnosis") / WEIGHTS).read_text(encoding="utf-8")
+def _fitted(name: str = WEIGHTS) -> tuple[float, np.ndarray[Any, np.dtype[np.float64]]]:
+    text = (resources.files("ident.diagnosis") / name).read_text(encoding="utf-8")
     content = yaml_content(text)
     if set(content["weights"]) != set(LIMITS):
-        raise ConfigurationError(f"{WEIGHTS} is of other grounds; run `python -m benchmarks.confidence`")
+        raise ConfigurationError(f"{name} is of other grounds; run `python -m benchmarks.confidence`")
     return float(content["intercept"]), np.array([float(content["weights"][name]) for name in LIMITS])

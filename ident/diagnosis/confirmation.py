@@ -237,6 +237,7 @@ def _grounds(
         one_block=float(not untested and not spread_out(without, after, list(claim.trial.rows))),
         worse=float(not untested and bool(worse_rows(without, after, seed, acting))),
         habitual=float(effect.character),
+        alone=float(not bench.dictionary.setting.compared),
         company=float(sum(other.gain > claim.gain for other in claims)),
     )
 

@@ -41,7 +41,8 @@ def test_more_for_a_finding_never_lowers_its_confidence(ground: str) -> None:
 def test_grounds_beyond_their_range_count_as_its_end() -> None:
     assert scaled(replace(USUAL, gain=1e9).to_dict())[0] == 1.0
     assert scaled(replace(USUAL, gain=-5.0).to_dict())[0] == 0.0
-    assert tuple(USUAL.to_dict()) == tuple(LIMITS) == tuple(SIGNS)
+    assert tuple(USUAL.to_dict()) == (*LIMITS, "alone")
+    assert tuple(LIMITS) == tuple(SIGNS)
 
 
 def test_a_finding_is_told_if_one_of_its_causes_is_more_likely_right_than_none() -> None:
