@@ -363,8 +363,7 @@ class Dictionary:
         """How much these motions show of a candidate, by shape of its grid: the mean fall of the chi-square for a unit
         of its coefficients, beside the base alone. Empty for events, which are anywhere."""
         if candidate.key not in self._information:
-            effect = candidate.effect
-            entries = [] if effect.event else self._prepared(candidate)
+            entries = [] if candidate.effect.event else self._prepared(candidate)
             self._information[candidate.key] = {
                 repr(shape): self.evidence.information(known) for shape, _, known in entries
             }

@@ -22,7 +22,7 @@ from lwr_driver.yaml_text import yaml_content
 WEIGHTS = "confidence.yaml"
 """Of findings against a healthy arm."""
 ALONE = "confidence_alone.yaml"
-"""Of those without one: fitted to arms of two simulations alone, which real arms without a reference bear out."""
+"""Of those without one: an earlier fit to findings against a healthy arm, borne out by recordings of real arms."""
 
 HARDLY = 0.5
 """Least probability of a finding: more likely right than wrong."""
