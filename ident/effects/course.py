@@ -69,19 +69,18 @@ class Drifting(Effect):
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """From a fifth of the session to a steady drift, and between sessions if there are several."""
         longest = max(setting.durations_s)
+        steady = Course.STEADY in self.courses
+        times = [share * longest for share in (_SHARES if steady else (*_SHARES, _STEADY))]
+        lasting = _LASTING_S if setting.pauses else ()
         step = Course.LEVEL_AND_STEP if setting.compared else Course.STEP
-        shares = _SHARES if Course.STEADY in self.courses else (*_SHARES, _STEADY)
-        times: dict[Course, Sequence[float]] = {
-            Course.STEADY: (),
-            Course.CARRIED: _LASTING_S if setting.pauses else (),
-        }
         return [
             *(
                 Shape(form, time_constant=time)
                 for form in self.courses
-                for time in times.get(form, [share * longest for share in shares])
+                if form is not Course.STEADY
+                for time in (lasting if form is Course.CARRIED else times)
             ),
-            *([Shape(Course.STEADY)] if Course.STEADY in self.courses else []),
+            *([Shape(Course.STEADY)] if steady else []),
             *(Shape(step, since=k) for k in range(2, setting.sessions + 1)),
             Shape(Course.SINCE_REFERENCE),
         ]
