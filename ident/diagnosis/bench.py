@@ -12,7 +12,7 @@ from ident.diagnosis.candidates import Dictionary, Trial
 from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.noise import misfit, noise_floor, repeatability
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal, structure_of
-from ident.diagnosis.nominal_arm import NominalArm
+from ident.diagnosis.nominal_arm import STATED_WITHIN, NominalArm
 from ident.diagnosis.products import Floats
 from ident.diagnosis.recording import SessionRecord
 from ident.diagnosis.reference import Reference, joint_of, symbol_of
@@ -32,15 +32,15 @@ _BORNE: dict[str, Side] = {"Fcl": "joint", "offl": "joint", "Fcm": "motor", "off
 _ANYTHING = 1e3
 # Largest relative change of a compliance in a step.
 _LARGEST_STEP = 0.35
+# Largest compliance behind encoders at the links, over the largest one of the description.
+_MOST = 1.5
 _FACTORS = (0.5, 0.7, 1.0, 1.4)
 
 # Largest noise beside the claims, over that before: the law of a cause is coarse, and a healthy arm's noise is known.
 _LOUDER = 2.0
 
-STATED_WITHIN = 2.0
-"""Factor within which a stiffness of the arm's description is known."""
 UNSURE = 0.5
-"""Relative standard deviation of such a compliance."""
+"""Relative standard deviation of a compliance that is known within a factor of two."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +55,15 @@ class ArmData:
 
 @dataclass(eq=False)
 class DiagnosisBench:
-    """The nominal arm with its evidence and dictionary; `repeatable` : noise is known from repeated periods."""
+    """The nominal arm with its evidence and dictionary. repeatable : noise is known from repeated periods.
+    compliance_std : (n,) of a fitted compliance by these sessions alone [rad/Nm], infinite where none was fitted.
+    """
 
     nominal: Nominal
     evidence: Evidence
     dictionary: Dictionary
     repeatable: bool
+    compliance_std: Floats | None = None
 
 
 def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None) -> NominalArm:
@@ -120,13 +123,16 @@ def prepare_bench(
 ) -> DiagnosisBench:
     """Rows, noise and evidence of the nominal arm, its stiffness fitted where nothing better is known."""
     # A fitted arm is near enough, and scaled again in each round it would lose the description.
-    as_described = np.any(arm.compliance > 0.0) and np.array_equal(arm.compliance, arm.anchor)
-    if fit_compliance and arm.encoder == "motor" and as_described:
+    elastic = fit_compliance and np.any(arm.anchor > 0.0)
+    as_described = (
+        arm.stated is None or np.array_equal(arm.compliance, arm.anchor) or not arm.compliance.any()
+    )
+    if elastic and arm.encoder == "motor" and as_described:
         arm = _roughly_stiff(arm, recordings, settings, reference)
     structure, base = structure_of(arm, recordings)
     nominal = Nominal(arm, recordings, settings, structure, base)
     prior = _drawn(nominal) if reference is None else reference.prior(base, nominal.masses)
-    fitted = fit_compliance and np.any(arm.compliance > 0.0) and len(nominal.rows) == 2
+    fitted = elastic and len(nominal.rows) == 2
     # Predictions of the second round include the reference; a third changes nothing.
     rounds = 3 if fitted else 2 if reference is not None else 1
     # These days alone come first, but for what only a channel left out would tell.
@@ -135,15 +141,16 @@ def prepare_bench(
         unknown = np.diag(prior[0]) <= 0.0
         prior = prior[0] + np.diag(np.where(unknown, _ANYTHING**-2.0, 0.0)), prior[1]
     evidence, repeatable = _evidence(nominal, settings, None if reference is not None and whole else prior)
+    std: Floats | None = None
     for _ in range(rounds):
         nominal.refine(evidence.full.values[: len(base)])
         evidence, repeatable = _evidence(nominal, settings, prior, reference)
         if fitted:
-            change = _compliance_step(nominal, evidence, arm)
+            change, std = _compliance_step(nominal, evidence, arm)
             if np.all(np.abs(change) < 0.03 * arm.compliance):
                 break
             nominal.arm = replace(nominal.arm, compliance=nominal.arm.compliance + change)
-    return DiagnosisBench(nominal, evidence, Dictionary(nominal, evidence, causes), repeatable)
+    return DiagnosisBench(nominal, evidence, Dictionary(nominal, evidence, causes), repeatable, std)
 
 
 def _drawn(nominal: Nominal) -> tuple[Floats, Floats]:
@@ -225,7 +232,8 @@ def _roughly_stiff(
     reference: Reference | None,
 ) -> NominalArm:
     """The arm with its compliance times the factor of the best fit, as a start near enough for derivatives."""
-    tried = [replace(arm, compliance=factor * arm.compliance, stated=arm.anchor) for factor in _FACTORS]
+    wider = np.log(arm.within) / np.log(STATED_WITHIN)
+    tried = [replace(arm, compliance=factor**wider * arm.anchor, stated=arm.anchor) for factor in _FACTORS]
     misfits = [
         prepare_bench(one, recordings, settings, reference, (), fit_compliance=False).evidence.chi_square
         for one in tried
@@ -233,27 +241,29 @@ def _roughly_stiff(
     return tried[int(np.argmin(misfits))]
 
 
-def _compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalArm) -> Floats:
-    """Gauss-Newton step (n,) of the joints' compliance. With encoders at the links, the twist of a joint shows in its
-    own motor row alone; with encoders at the motors it moves all links."""
+def _compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalArm) -> tuple[Floats, Floats]:
+    """Gauss-Newton step (n,) of the joints' compliance, and their standard deviations by these rows alone. With
+    encoders at the links, the twist of a joint shows in its own motor row alone; with encoders at the motors it moves
+    all links."""
     if nominal.arm.encoder == "motor":
         return _common_compliance_step(nominal, evidence, arm)
-    here, step = nominal.arm.compliance, np.zeros(nominal.arm.chain.n)
+    here, step, known = nominal.arm.compliance, np.zeros(arm.chain.n), np.full(arm.chain.n, np.inf)
     dictionary = Dictionary(nominal, evidence, [ELASTICITY.cause])
     for candidate in dictionary.candidates:
         rows = dictionary.rows(candidate, ELASTICITY.at_encoder("link"))
         score = evidence.score(evidence.padded(rows))
         j = candidate.joint
         value, std = float(score.coefficients[0]), float(np.sqrt(score.covariance[0, 0]))
+        known[j] = std
         if abs(value) > 3.0 * std:
-            step[j] = np.clip(here[j] + value, 0.0, 3.0 * arm.anchor[j]) - here[j]
-    return step
+            step[j] = np.clip(here[j] + value, 0.0, _MOST * arm.within * arm.anchor[j]) - here[j]
+    return step, known
 
 
-def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalArm) -> Floats:
-    """Step (n,) of all joints' compliance beside the channels' delays, at most a third of each and within a factor
-    `STATED_WITHIN` of the description's, which decides where a joint hardly bends."""
-    here, step = nominal.arm.compliance, np.zeros(nominal.arm.chain.n)
+def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalArm) -> tuple[Floats, Floats]:
+    """Step (n,) of all joints' compliance and their standard deviations, beside the channels' delays: at most a third
+    of each, and within a factor `within` of the description's, which decides where a joint hardly bends."""
+    here, step, known = nominal.arm.compliance, np.zeros(arm.chain.n), np.full(arm.chain.n, np.inf)
     dictionary = Dictionary(nominal, evidence, [e.cause for e in (ELASTICITY, *DELAYS.values())])
     bent = [c for c in dictionary.candidates if c.joint >= 0 and here[c.joint] > 0.0]
     late = [c for c in dictionary.candidates if c.joint < 0]
@@ -265,15 +275,14 @@ def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalAr
     evidence.replace(kept)
     joints = [c.joint for c in bent]
     stated = arm.anchor[joints]
-    precision = np.diag((UNSURE * stated) ** -2.0)
+    precision = np.diag((UNSURE * arm.within / STATED_WITHIN * stated) ** -2.0)
     information = np.linalg.inv(covariance + np.diag(1e-12 * np.diag(covariance) + 1e-30))
     pull = information @ change + precision @ (stated - here[joints])
     found = np.linalg.solve(information + precision, pull)
     found = np.clip(found, -_LARGEST_STEP * here[joints], _LARGEST_STEP * here[joints])
-    step[joints] = (
-        np.clip(here[joints] + found, stated / STATED_WITHIN, stated * STATED_WITHIN) - here[joints]
-    )
-    return step
+    known[joints] = np.sqrt(np.diag(covariance))
+    step[joints] = np.clip(here[joints] + found, stated / arm.within, stated * arm.within) - here[joints]
+    return step, known
 
 
 def again_with(

@@ -12,7 +12,6 @@ import numpy as np
 
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.bench import (
-    STATED_WITHIN,
     UNSURE,
     ArmData,
     DiagnosisBench,
@@ -27,7 +26,7 @@ from ident.diagnosis.character import character
 from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std, habit, largest_left
 from ident.diagnosis.held_out import held_out
 from ident.diagnosis.noise import misfit
-from ident.diagnosis.nominal_arm import NominalArm
+from ident.diagnosis.nominal_arm import STATED_WITHIN, NominalArm
 from ident.diagnosis.presliding import SlowTurns, presliding_length, slow_turns, with_far_presliding
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.products import Floats, Rows
@@ -62,6 +61,8 @@ _ROUNDS = 3
 _LATEST_S = 0.02
 # Share of the factor of a stated stiffness within which a fit is at its end.
 _END = 1.05
+# Least compliance of a joint of unknown stiffness, in its standard errors.
+_TOLD = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +116,8 @@ def commission(
     parts = [sorted(part, key=lambda s: s.start) for part in map(as_sessions, sets) if part]
     if not parts:
         raise DataError("no session given; name at least one healthy session")
-    start = replace(nominal_arm(chain, arm, None), encoder_known=True)
-    sides: tuple[Side, ...] = ("link", "motor") if np.any(start.compliance > 0.0) else ("link",)
+    start = replace(nominal_arm(chain, arm, None), encoder_known=True).of_unknown_stiffness()
+    sides: tuple[Side, ...] = ("link", "motor") if np.any(start.anchor > 0.0) else ("link",)
     couplings = () if arm is None else arm.couplings
     stated = settings.signals
     settings = settled_for_all(settings, parts[:_TUNING_SETS], chain, couplings)
@@ -144,10 +145,16 @@ def commission(
     ]
     late = common_delays(delays)
     one = _tuned(tuned[side].arm, first, settings, _ROUNDS, late)
-    several, base = [one.arm], one.base
-    for recordings in recorded[1:_TUNING_SETS]:
-        several.append(_tuned(one.arm, recordings, settings, 1, late).arm)
-    known = as_stated(_middle(several), [one.compliance for one in several])
+    base = one.base
+    several = [
+        one,
+        *(_tuned(one.arm, recordings, settings, 1, late) for recordings in recorded[1:_TUNING_SETS]),
+    ]
+    known = as_stated(
+        _middle([tuned.arm for tuned in several]),
+        [tuned.arm.compliance for tuned in several],
+        [tuned.compliance_std for tuned in several if tuned.compliance_std is not None],
+    )
     days = [_day(known, recordings, settings, base) for recordings in recorded]
     known = with_far_presliding(known, [day.slow_turns for day in days], [day.coulomb for day in days])
     for _ in range(_SETTLING):
@@ -213,10 +220,12 @@ def _largest_losses(sets: Sequence[Sequence[Session]]) -> dict[str, float]:
 
 
 class _Tuned(NamedTuple):
-    """Chi-square of a row, the arm, and the base set of its bench."""
+    """Chi-square of a row, the arm, the standard deviation of its compliance by the set's rows, and the base set of its
+    bench."""
 
     misfit: float
     arm: NominalArm
+    compliance_std: Floats | None
     base: BaseSet
 
 
@@ -255,7 +264,7 @@ def _tuned(
             presliding=presliding_length(bench.nominal, evidence.full.values[: len(base)]),
         )
         arm = _later(arm, {side: mean_delay(nuisance, side)[0] for side in CHANNELS if side not in late})
-    return _Tuned(misfit, arm, base)
+    return _Tuned(misfit, arm, bench.compliance_std, base)
 
 
 def _later(arm: NominalArm, by: Mapping[str, float]) -> NominalArm:
@@ -281,28 +290,40 @@ def _middle(arms: Sequence[NominalArm]) -> NominalArm:
     )
 
 
-def as_stated(arm: NominalArm, sets: Sequence[Floats]) -> NominalArm:
-    """The arm with the standard error of its compliance from those of the sets (n,) [rad/Nm], and with the stated one,
-    known to a factor, where encoders at the motors do not tell it: the sets do not agree on one, or end at that factor.
-    Behind encoders at the links a stated one that no set shows is unknown.
+def as_stated(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = ()) -> NominalArm:
+    """The arm with the standard error of its compliance from those of the sets (n,) [rad/Nm] and by each one's rows,
+    and with the stated one, known to a factor, where encoders at the motors do not tell it: the sets do not agree on
+    one, or end at that factor.
+    Behind encoders at the links a stated one that no set shows is unknown. Without a stated one a joint is rigid where
+    the sets do not clearly tell that it twists.
     """
-    std = compliance_std(sets)
+    std = compliance_std(sets, own)
     if arm.stated is None:
         return replace(arm, compliance_std=std)
+    if arm.within > STATED_WITHIN:
+        low, high = _END / arm.within * arm.stated, arm.within / _END * arm.stated
+        between = np.all([(low < one) & (one < high) for one in sets], axis=0)
+        told = between & (arm.compliance > (0.0 if std is None else _TOLD * std))
+        return replace(
+            arm,
+            compliance=np.where(told, arm.compliance, 0.0),
+            compliance_std=None if std is None else np.where(told, std, 0.0),
+        )
     if arm.encoder == "link":
         # A fit that ends at a rigid joint in every set does not differ from set to set.
         ended = (arm.compliance <= 0.0) & (arm.stated > 0.0)
         return replace(arm, compliance_std=None if std is None else np.where(ended, UNSURE * arm.stated, std))
     factors = np.array(sets) / np.maximum(arm.stated, 1e-300)
     ends = np.any((factors < _END / STATED_WITHIN) | (factors > STATED_WITHIN / _END), axis=0)
-    unknown = (arm.stated > 0.0) & (ends | unsure(arm.compliance, std))
-    own = np.zeros(len(arm.stated)) if std is None else std
+    # The fit of each set is held to the stated one as far as its rows do not tell.
+    unknown = (arm.stated > 0.0) & (ends | unsure(arm.compliance, compliance_std(sets)))
+    known = np.zeros(len(arm.stated)) if std is None else std
     if std is None and not unknown.any():
         return arm
     return replace(
         arm,
         compliance=np.where(unknown, arm.stated, arm.compliance),
-        compliance_std=np.where(unknown, UNSURE * arm.stated, own),
+        compliance_std=np.where(unknown, UNSURE * arm.stated, known),
     )
 
 

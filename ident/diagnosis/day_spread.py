@@ -28,11 +28,17 @@ _OFFSETS = ("offl", "offm")
 _ALIKE = 4.0
 
 
-def compliance_std(sets: Sequence[Floats]) -> Floats | None:
-    """Standard error (n,) [rad/Nm] of the mean of the compliances (n,) of healthy sets, None for a single set."""
-    if len(sets) < 2:
+def compliance_std(sets: Sequence[Floats], own: Sequence[Floats] = ()) -> Floats | None:
+    """Standard error (n,) [rad/Nm] of the mean of the compliances (n,) of healthy sets, from their scatter and the
+    standard deviation by each one's rows; None for a single set without the latter.
+
+    A few sets may agree by chance, or by what their fits are held to.
+    """
+    if len(sets) < 2 and not own:
         return None
-    return np.asarray(np.std(sets, axis=0, ddof=1) / np.sqrt(len(sets)))
+    scatter = np.std(sets, axis=0, ddof=1) if len(sets) > 1 else np.zeros(len(sets[0]))
+    alone = np.sqrt(np.mean(np.square(own), axis=0)) if own else np.zeros(len(sets[0]))
+    return np.asarray(np.maximum(scatter, alone) / np.sqrt(len(sets)))
 
 
 def delay_std(late: Sequence[tuple[float, float]]) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +15,12 @@ from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of
 from ident.effects.motion import dahl
 
 Floats = NDArray[np.float64]
+
+STATED_WITHIN = 2.0
+"""Factor within which a stiffness of the arm's description is known."""
+_ANY_WITHIN = 8.0
+# Twist of a geared joint [rad] under its largest torque: that of strain-wave gears and of torque sensors.
+_USUAL_TWIST = 0.008
 
 GAIN_STD = SENSOR_GAIN.usual_change
 """Usual standard deviation of a torque sensor's gain from day to day."""
@@ -32,7 +38,8 @@ class NominalArm:
     unknown.
     far, far_share : (n,) longer distance [rad] for a share of that friction, and the share.
     gain_std : of the torque sensors' gains from day to day. stated : (n,) compliance of the arm's description
-    [rad/Nm], `compliance` by default. compliance_std : (n,) standard error of that of a healthy arm.
+    [rad/Nm], `compliance` by default; within : factor within which it is known. compliance_std : (n,) standard error
+    of that of a healthy arm.
     couplings : pairs of joints with coupled drives. healthy : entries of the healthy arm's own effects
     (`ident.effects`); their torque is part of the nominal one, so that a cause is a change against this arm.
     """
@@ -51,12 +58,21 @@ class NominalArm:
     couplings: tuple[Coupling, ...] = ()
     healthy: tuple[Mapping[str, Any], ...] = ()
     stated: Floats | None = None
+    within: float = STATED_WITHIN
     compliance_std: Floats | None = None
 
     @property
     def anchor(self) -> Floats:
         """Compliance (n,) [rad/Nm] around which a fit stays."""
         return self.compliance if self.stated is None else self.stated
+
+    def of_unknown_stiffness(self) -> NominalArm:
+        """The arm for a fit of a stiffness that its description lacks, around the usual one of such gears; as it is
+        where the URDF does not state the largest torques."""
+        efforts = self.chain.efforts()
+        if np.any(self.anchor > 0.0) or efforts is None:
+            return self
+        return replace(self, stated=_USUAL_TWIST / efforts, within=_ANY_WITHIN)
 
     @property
     def delays(self) -> dict[str, float]:

@@ -113,7 +113,7 @@ class JointElasticity(_Twisting):
         for place in _places(setting):
             if place is _Encoder.MOTOR and setting.compliance is not None:
                 own = float(setting.compliance[joint])
-                found += [Shape(place, size=share * own) for share in _SHARES]
+                found += [Shape(place, size=share * own) for share in _SHARES] if own else [Shape(place)]
             else:
                 found.append(Shape(place))
         return found

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 
 _RECORDED_SETS = 3
 _LOUDEST = 5
-_RIGID = "taken as the links', for no stiffness of the joints is given (`--stiffness`)"
+_RIGID = (
+    "taken as the links', for no stiffness is given (`--stiffness`) and the sets show no twist of the joints"
+)
 _FIRST_SEED = 1001
 """Seed of the emulator's noise in the first set; other runs begin at 1, so no noise comes twice."""
 
@@ -117,7 +119,8 @@ def command(
     if as_json:
         click.echo(to_json(_content(found, paths, out)))
     else:
-        _ending(found, len(parts), sum(map(len, parts)), chain.joint_names, out).tell()
+        stated = data.stiffness is not None
+        _ending(found, len(parts), sum(map(len, parts)), chain.joint_names, out, stated=stated).tell()
 
 
 def record_sets(
@@ -200,17 +203,19 @@ def _content(found: Reference, paths: list[list[Path]], out: Path) -> dict[str, 
     return {"file": out, "sets": paths, **{k: v for k, v in stored.items() if k != "sets"}}
 
 
-def _ending(found: Reference, sets: int, sessions: int, names: tuple[str, ...], out: Path) -> Ending:
+def _ending(
+    found: Reference, sets: int, sessions: int, names: tuple[str, ...], out: Path, *, stated: bool
+) -> Ending:
     from runner.ending import Ending
     from runner.report.verdicts import Verdict
 
     rows: list[tuple[str, ...]] = []
-    if len(found.compliance) and (found.compliance > 0.0).all():
-        rows.append(("stiffness [Nm/rad]", *(f"{1.0 / c:.0f}" for c in found.compliance)))
+    if (found.compliance > 0.0).any():
+        rows.append(("stiffness [Nm/rad]", *(f"{1.0 / c:.0f}" if c else "rigid" for c in found.compliance)))
         if found.compliance_std is not None:
-            shares = 100.0 * found.compliance_std / found.compliance
-            differ = (f"{share:.0f}" if share > 0.0 else "–" for share in shares)
-            rows.append(("  ± where sets differ [%]", *differ))
+            known = zip(found.compliance_std, found.compliance, strict=True)
+            differ = (f"{100.0 * std / c:.0f}" if std > 0.0 and c > 0.0 else "–" for std, c in known)
+            rows.append(("  ± [%]", *differ))
     rows += [(f"noise, {side} [Nm]", *(f"{v:.4f}" for v in values)) for side, values in found.noise.items()]
     delays = [
         (f"{side} torque", f"{1e3 * delay:.2f} ± {1e3 * found.delay_std_s[side]:.2f} ms from day to day")
@@ -235,8 +240,9 @@ def _ending(found: Reference, sets: int, sessions: int, names: tuple[str, ...], 
         )
         look.append(Verdict("few sets", text, "", "look"))
     if unknown := ", ".join(found.unknown_stiffness):
-        stated = "taken as stated, known within a factor of two; " if found.encoder == "motor" else ""
-        text = f"the sets do not tell it within 20 % in {unknown}; {stated}more sets, or faster motions"
+        taken = stated and found.encoder == "motor"
+        taken_as = "taken as stated, known within a factor of two; " if taken else ""
+        text = f"the sets do not tell it within 20 % in {unknown}; {taken_as}more sets, or faster motions"
         look.append(Verdict("stiffness unknown", text, "", "look"))
     return Ending(
         "look" if look else "good",

@@ -194,9 +194,29 @@ def test_rounds_of_a_fit_stay_near_the_stated_stiffness(
     )
     fitted = replace(arm, encoder="motor", compliance=np.full(3, 1e-4), stated=np.full(3, 1e-4))
     for _ in range(9):
-        step = bench._compliance_step(SimpleNamespace(arm=fitted), evidence, fitted)
+        step, std = bench._compliance_step(SimpleNamespace(arm=fitted), evidence, fitted)
         fitted = replace(fitted, compliance=fitted.compliance + step)
     np.testing.assert_allclose(fitted.compliance, 0.5e-4)
+    np.testing.assert_allclose(std, 1e-7)
+
+
+def test_joints_of_an_undescribed_arm_twist_where_the_sets_clearly_tell_it(arm: NominalArm) -> None:
+    usual = np.full(3, 1e-4)
+    # Told, told less than twice its deviation, and at the end of the range of any gear.
+    sets = [np.array([0.8e-4, 0.5e-4, 7.9e-4])] * 2
+    own = [np.array([0.05e-4, 0.6e-4, 0.01e-4])] * 2
+    undescribed = replace(arm, encoder="motor", compliance=sets[0], stated=usual, within=8.0)
+    for encoder in ("motor", "link"):
+        found = as_stated(replace(undescribed, encoder=encoder), sets, own)
+        np.testing.assert_array_equal(found.compliance, [0.8e-4, 0.0, 0.0])
+        assert found.compliance_std is not None
+        np.testing.assert_allclose(found.compliance_std, [0.05e-4 / np.sqrt(2.0), 0.0, 0.0])
+
+
+def test_sets_that_agree_know_a_stiffness_no_better_than_their_rows() -> None:
+    sets, own = [np.full(3, 1e-4)] * 4, [np.array([0.0, 1e-5, 2e-5])] * 4
+    np.testing.assert_allclose(compliance_std(sets, own), [0.0, 0.5e-5, 1e-5])
+    np.testing.assert_allclose(compliance_std(sets[:1], own[:1]), own[0])
 
 
 def test_one_set_says_nothing_of_its_stiffness(model: DynamicModel) -> None:
