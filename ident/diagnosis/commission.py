@@ -63,6 +63,8 @@ _LATEST_S = 0.02
 _END = 1.05
 # Least compliance of a joint of unknown stiffness, in its standard errors.
 _TOLD = 2.0
+# Least fall of the logarithm of the chi-square by encoders at the motors of such an arm.
+_CLEARLY = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +139,7 @@ def commission(
         arm_of_side = replace(start, encoder=side)
         told[side] = channel_delays(parts[0], arm_of_side, settings)
         tuned[side] = _tuned(arm_of_side, first, slow, 2, common_delays([told[side]]))
-    side = min(sides, key=lambda one: tuned[one].misfit)
+    side = _encoder(start, {one: tuned[one].misfit for one in sides})
     log.info("positions of the %s", side)
     delays = [
         told[side],
@@ -265,6 +267,13 @@ def _tuned(
         )
         arm = _later(arm, {side: mean_delay(nuisance, side)[0] for side in CHANNELS if side not in late})
     return _Tuned(misfit, arm, bench.compliance_std, base)
+
+
+def _encoder(arm: NominalArm, misfits: Mapping[Side, float]) -> Side:
+    """The side of the joints that the positions come from: that of the least misfit. Of an arm whose description states
+    no stiffness, that of the motors has to be clearly less: a twist of any size takes something off."""
+    motor = misfits.get("motor", np.inf) + (_CLEARLY if arm.within > STATED_WITHIN else 0.0)
+    return "motor" if motor < misfits["link"] else "link"
 
 
 def _later(arm: NominalArm, by: Mapping[str, float]) -> NominalArm:

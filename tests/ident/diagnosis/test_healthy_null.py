@@ -11,7 +11,7 @@ import pytest
 from ident.diagnosis import bench, channel_delays, recording
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.channel_delays import common_delays
-from ident.diagnosis.commission import as_stated
+from ident.diagnosis.commission import _encoder, as_stated
 from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std
 from ident.diagnosis.diagnose import late_by_themselves
 from ident.diagnosis.healthy_null import HealthyNull
@@ -211,6 +211,16 @@ def test_joints_of_an_undescribed_arm_twist_where_the_sets_clearly_tell_it(arm: 
         np.testing.assert_array_equal(found.compliance, [0.8e-4, 0.0, 0.0])
         assert found.compliance_std is not None
         np.testing.assert_allclose(found.compliance_std, [0.05e-4 / np.sqrt(2.0), 0.0, 0.0])
+
+
+def test_encoders_of_an_undescribed_arm_are_at_the_links_unless_the_motors_are_clearly_better(
+    arm: NominalArm,
+) -> None:
+    undescribed, described = replace(arm, within=8.0), replace(arm, within=2.0)
+    assert _encoder(undescribed, {"link": -7.32, "motor": -7.36}) == "link"
+    assert _encoder(described, {"link": -7.32, "motor": -7.36}) == "motor"
+    assert _encoder(undescribed, {"link": -6.67, "motor": -7.01}) == "motor"
+    assert _encoder(described, {"link": -7.0}) == "link"
 
 
 def test_sets_that_agree_know_a_stiffness_no_better_than_their_rows() -> None:
