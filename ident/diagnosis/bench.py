@@ -124,9 +124,7 @@ def prepare_bench(
     """Rows, noise and evidence of the nominal arm, its stiffness fitted where nothing better is known."""
     # A fitted arm is near enough, and scaled again in each round it would lose the description.
     elastic = fit_compliance and np.any(arm.anchor > 0.0)
-    as_described = (
-        arm.stated is None or np.array_equal(arm.compliance, arm.anchor) or not arm.compliance.any()
-    )
+    as_described = np.array_equal(arm.compliance, arm.anchor) or not arm.compliance.any()
     if elastic and arm.encoder == "motor" and as_described:
         arm = _roughly_stiff(arm, recordings, settings, reference)
     structure, base = structure_of(arm, recordings)

@@ -118,8 +118,6 @@ def commission(
     parts = [sorted(part, key=lambda s: s.start) for part in map(as_sessions, sets) if part]
     if not parts:
         raise DataError("no session given; name at least one healthy session")
-    start = replace(nominal_arm(chain, arm, None), encoder_known=True).of_unknown_stiffness()
-    sides: tuple[Side, ...] = ("link", "motor") if np.any(start.anchor > 0.0) else ("link",)
     couplings = () if arm is None else arm.couplings
     stated = settings.signals
     settings = settled_for_all(settings, parts[:_TUNING_SETS], chain, couplings)
@@ -131,6 +129,11 @@ def commission(
         records = [record(s, k, chain, settings, recall=recall) for k, s in enumerate(part)]
         recorded.append(list(without_broken(records, broken)))
         every_joint_moves(recorded[-1], chain)
+    start = replace(nominal_arm(chain, arm, None), encoder_known=True)
+    if all(one.has_effort and one.has_motor for records in recorded for one in records):
+        # One torque alone does not tell a twist from friction and inertia.
+        start = start.of_unknown_stiffness()
+    sides: tuple[Side, ...] = ("link", "motor") if np.any(start.anchor > 0.0) else ("link",)
     first = recorded[0]
     # Both sides in bins long enough to average the links' ringing, for a fair comparison.
     slow = replace(settings, bin_s=max(settings.bin_s, settings.ringing_s))
@@ -302,9 +305,8 @@ def _middle(arms: Sequence[NominalArm]) -> NominalArm:
 def as_stated(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = ()) -> NominalArm:
     """The arm with the standard error of its compliance from those of the sets (n,) [rad/Nm] and by each one's rows,
     and with the stated one, known to a factor, where encoders at the motors do not tell it: the sets do not agree on
-    one, or end at that factor.
-    Behind encoders at the links a stated one that no set shows is unknown. Without a stated one a joint is rigid where
-    the sets do not clearly tell that it twists.
+    one, or end at that factor. Behind encoders at the links a stated one that no set shows is unknown. Without a stated
+    one a joint is rigid where the sets do not clearly tell that it twists.
     """
     std = compliance_std(sets, own)
     if arm.stated is None:
