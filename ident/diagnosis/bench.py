@@ -32,8 +32,6 @@ _BORNE: dict[str, Side] = {"Fcl": "joint", "offl": "joint", "Fcm": "motor", "off
 _ANYTHING = 1e3
 # Largest relative change of a compliance in a step.
 _LARGEST_STEP = 0.35
-# Largest compliance behind encoders at the links, over the largest one of the description.
-_MOST = 1.5
 _FACTORS = (0.5, 0.7, 1.0, 1.4)
 
 # Largest noise beside the claims, over that before: the law of a cause is coarse, and a healthy arm's noise is known.
@@ -246,6 +244,7 @@ def _compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalArm) -> t
     if nominal.arm.encoder == "motor":
         return _common_compliance_step(nominal, evidence, arm)
     here, step, known = nominal.arm.compliance, np.zeros(arm.chain.n), np.full(arm.chain.n, np.inf)
+    most = arm.largest_compliance
     dictionary = Dictionary(nominal, evidence, [ELASTICITY.cause])
     for candidate in dictionary.candidates:
         rows = dictionary.rows(candidate, ELASTICITY.at_encoder("link"))
@@ -254,7 +253,7 @@ def _compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalArm) -> t
         value, std = float(score.coefficients[0]), float(np.sqrt(score.covariance[0, 0]))
         known[j] = std
         if abs(value) > 3.0 * std:
-            step[j] = np.clip(here[j] + value, 0.0, _MOST * arm.within * arm.anchor[j]) - here[j]
+            step[j] = np.clip(here[j] + value, 0.0, most[j]) - here[j]
     return step, known
 
 
@@ -279,7 +278,8 @@ def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalAr
     found = np.linalg.solve(information + precision, pull)
     found = np.clip(found, -_LARGEST_STEP * here[joints], _LARGEST_STEP * here[joints])
     known[joints] = np.sqrt(np.diag(covariance))
-    step[joints] = np.clip(here[joints] + found, stated / arm.within, stated * arm.within) - here[joints]
+    largest = arm.largest_compliance[joints]
+    step[joints] = np.clip(here[joints] + found, stated / arm.within, largest) - here[joints]
     return step, known
 
 

@@ -312,7 +312,7 @@ def as_stated(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = (
     if arm.stated is None:
         return replace(arm, compliance_std=std)
     if arm.within > STATED_WITHIN:
-        low, high = _END / arm.within * arm.stated, arm.within / _END * arm.stated
+        low, high = _END / arm.within * arm.stated, arm.largest_compliance / _END
         between = np.all([(low < one) & (one < high) for one in sets], axis=0)
         told = between & (arm.compliance > (0.0 if std is None else _TOLD * std))
         return replace(
@@ -321,8 +321,9 @@ def as_stated(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = (
             compliance_std=None if std is None else np.where(told, std, 0.0),
         )
     if arm.encoder == "link":
-        # A fit that ends at a rigid joint in every set does not differ from set to set.
-        ended = (arm.compliance <= 0.0) & (arm.stated > 0.0)
+        # A fit that ends at a rigid joint, or at the softest one, in every set does not differ from set to set.
+        ended = (arm.compliance <= 0.0) | (arm.compliance >= arm.largest_compliance / _END)
+        ended &= arm.stated > 0.0
         return replace(arm, compliance_std=None if std is None else np.where(ended, UNSURE * arm.stated, std))
     factors = np.array(sets) / np.maximum(arm.stated, 1e-300)
     ends = np.any((factors < _END / STATED_WITHIN) | (factors > STATED_WITHIN / _END), axis=0)

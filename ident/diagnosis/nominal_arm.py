@@ -19,6 +19,8 @@ Floats = NDArray[np.float64]
 STATED_WITHIN = 2.0
 """Factor within which a stiffness of the arm's description is known."""
 _ANY_WITHIN = 8.0
+# The range of a fit behind encoders at the links over that factor: it is held to nothing else there.
+_WIDER = 1.5
 # Twist of a geared joint [rad] under its largest torque: that of strain-wave gears and of torque sensors.
 _USUAL_TWIST = 0.008
 
@@ -65,6 +67,11 @@ class NominalArm:
     def anchor(self) -> Floats:
         """Compliance (n,) [rad/Nm] around which a fit stays."""
         return self.compliance if self.stated is None else self.stated
+
+    @property
+    def largest_compliance(self) -> Floats:
+        """Largest compliance (n,) [rad/Nm] of a fit."""
+        return (_WIDER if self.encoder == "link" else 1.0) * self.within * self.anchor
 
     def of_unknown_stiffness(self) -> NominalArm:
         """The arm for a fit of a stiffness that its description lacks, around the usual one of such gears; as it is

@@ -175,6 +175,11 @@ def test_a_stiffness_that_the_sets_do_not_tell_is_the_stated_one(arm: NominalArm
         behind, encoder="link", compliance=rigid[0], stated=stated * (1.0, 1.0, 0.0), compliance_std=None
     )
     np.testing.assert_allclose(as_stated(ended, rigid).compliance_std, [0.0, 0.5e-4, 0.0])
+    # So does one that ends at the softest joint.
+    soft = [np.array([0.8e-4, 3e-4, 0.0])] * 2
+    np.testing.assert_allclose(
+        as_stated(replace(ended, compliance=soft[0]), soft).compliance_std, [0.0, 0.5e-4, 0.0]
+    )
 
 
 def test_rounds_of_a_fit_stay_near_the_stated_stiffness(
@@ -202,12 +207,12 @@ def test_rounds_of_a_fit_stay_near_the_stated_stiffness(
 
 def test_joints_of_an_undescribed_arm_twist_where_the_sets_clearly_tell_it(arm: NominalArm) -> None:
     usual = np.full(3, 1e-4)
-    # Told, told less than twice its deviation, and at the end of the range of any gear.
-    sets = [np.array([0.8e-4, 0.5e-4, 7.9e-4])] * 2
-    own = [np.array([0.05e-4, 0.6e-4, 0.01e-4])] * 2
-    undescribed = replace(arm, encoder="motor", compliance=sets[0], stated=usual, within=8.0)
-    for encoder in ("motor", "link"):
-        found = as_stated(replace(undescribed, encoder=encoder), sets, own)
+    for encoder, softest in (("motor", 7.9e-4), ("link", 11.9e-4)):
+        # Told, told less than twice its deviation, and at the end of the range of any gear.
+        sets = [np.array([0.8e-4, 0.5e-4, softest])] * 2
+        own = [np.array([0.05e-4, 0.6e-4, 0.01e-4])] * 2
+        undescribed = replace(arm, encoder=encoder, compliance=sets[0], stated=usual, within=8.0)
+        found = as_stated(undescribed, sets, own)
         np.testing.assert_array_equal(found.compliance, [0.8e-4, 0.0, 0.0])
         assert found.compliance_std is not None
         np.testing.assert_allclose(found.compliance_std, [0.05e-4 / np.sqrt(2.0), 0.0, 0.0])
