@@ -137,10 +137,12 @@ def commission(
     first = recorded[0]
     # Both sides in bins long enough to average the links' ringing, for a fair comparison.
     slow = replace(settings, bin_s=max(settings.bin_s, settings.ringing_s))
+    # Of rigid joints the delays do not depend on the side.
+    rigid = None if start.compliance.any() else channel_delays(parts[0], start, settings)
     told, tuned = {}, {}
     for side in sides:
         arm_of_side = replace(start, encoder=side)
-        told[side] = channel_delays(parts[0], arm_of_side, settings)
+        told[side] = channel_delays(parts[0], arm_of_side, settings) if rigid is None else rigid
         tuned[side] = _tuned(arm_of_side, first, slow, 2, common_delays([told[side]]))
     side = _encoder(start, {one: tuned[one].misfit for one in sides})
     log.info("positions of the %s", side)
@@ -311,10 +313,10 @@ def as_stated(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = (
     std = compliance_std(sets, own)
     if arm.stated is None:
         return replace(arm, compliance_std=std)
+    low, high = _END / arm.within * arm.stated, arm.largest_compliance / _END
+    ends = np.any([(one < low) | (one > high) for one in sets], axis=0)
     if arm.within > STATED_WITHIN:
-        low, high = _END / arm.within * arm.stated, arm.largest_compliance / _END
-        between = np.all([(low < one) & (one < high) for one in sets], axis=0)
-        told = between & (arm.compliance > (0.0 if std is None else _TOLD * std))
+        told = ~ends & (arm.compliance > (0.0 if std is None else _TOLD * std))
         return replace(
             arm,
             compliance=np.where(told, arm.compliance, 0.0),
@@ -322,11 +324,9 @@ def as_stated(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = (
         )
     if arm.encoder == "link":
         # A fit that ends at a rigid joint, or at the softest one, in every set does not differ from set to set.
-        ended = (arm.compliance <= 0.0) | (arm.compliance >= arm.largest_compliance / _END)
+        ended = (arm.compliance <= 0.0) | (arm.compliance >= high)
         ended &= arm.stated > 0.0
         return replace(arm, compliance_std=None if std is None else np.where(ended, UNSURE * arm.stated, std))
-    factors = np.array(sets) / np.maximum(arm.stated, 1e-300)
-    ends = np.any((factors < _END / STATED_WITHIN) | (factors > STATED_WITHIN / _END), axis=0)
     # The fit of each set is held to the stated one as far as its rows do not tell.
     unknown = (arm.stated > 0.0) & (ends | unsure(arm.compliance, compliance_std(sets)))
     known = np.zeros(len(arm.stated)) if std is None else std

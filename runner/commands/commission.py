@@ -240,9 +240,9 @@ def _ending(
         )
         look.append(Verdict("few sets", text, "", "look"))
     if unknown := ", ".join(found.unknown_stiffness):
-        taken = stated and found.encoder == "motor"
-        taken_as = "taken as stated, known within a factor of two; " if taken else ""
-        text = f"the sets do not tell it within 20 % in {unknown}; {taken_as}more sets, or faster motions"
+        held = stated and found.encoder == "motor"
+        held_to = "held to the stated one within a factor of two; " if held else ""
+        text = f"the sets do not tell it within 20 % in {unknown}; {held_to}more sets, or faster motions"
         look.append(Verdict("stiffness unknown", text, "", "look"))
     return Ending(
         "look" if look else "good",
