@@ -322,6 +322,9 @@ def as_stated(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = (
             compliance=np.where(told, arm.compliance, 0.0),
             compliance_std=None if std is None else np.where(told, std, 0.0),
         )
+    if std is not None:
+        # A joint that hardly moves tells nothing of its own.
+        std = np.where(np.isfinite(std), std, UNSURE * arm.stated)
     if arm.encoder == "link":
         # A fit that ends at a rigid joint, or at the softest one, in every set does not differ from set to set.
         ended = (arm.compliance <= 0.0) | (arm.compliance >= high)

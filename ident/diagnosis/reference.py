@@ -65,8 +65,8 @@ class Reference:
     delay_std_s : of the channels' delays from day to day, by side. habits : whether the covariance of the model holds
     the changes from day to day. masses : announced, of its payloads [kg].
     gain_std : of the torque sensors' gains from day to day. compliance_std : (n,) [rad/Nm] standard error of the
-    compliance from its scatter over the sets, None for a single one; 0 where no set differs from the first beyond
-    chance, and half of a stated compliance that the sets do not tell. shown : mean information of the sets on each
+    compliance by the sets' rows and its scatter over them, None where none was fitted; 0 of a joint taken as rigid, and
+    half of a stated compliance that the sets do not tell. shown : mean information of the sets on each
     candidate, by shape of its grid: the fall of the chi-square for a unit of its coefficients. usual : size of each
     candidate on the healthy arm. left : largest rms (n,) [Nm] by side of a held-out session of a healthy set, beside
     what differs from day to day; empty if unknown. lost : largest share of lost, repeated and stale samples of a
@@ -97,7 +97,7 @@ class Reference:
 
     @property
     def unknown_stiffness(self) -> tuple[str, ...]:
-        """Joints with a stiffness that the sets do not tell within 20 % (95 %); none without a scatter of sets."""
+        """Joints with a stiffness that the sets do not tell within 20 % (95 %); none where none was fitted."""
         names = self.model.structure.chain.joint_names
         found = unsure(self.compliance, self.compliance_std)
         return tuple(name for name, one in zip(names, found, strict=False) if one)

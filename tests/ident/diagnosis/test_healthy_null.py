@@ -11,7 +11,7 @@ import pytest
 from ident.diagnosis import bench, channel_delays, recording
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.channel_delays import common_delays
-from ident.diagnosis.commission import _encoder, as_stated
+from ident.diagnosis.commission import Side, _encoder, as_stated
 from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std
 from ident.diagnosis.diagnose import late_by_themselves
 from ident.diagnosis.healthy_null import HealthyNull
@@ -226,6 +226,13 @@ def test_encoders_of_an_undescribed_arm_are_at_the_links_unless_the_motors_are_c
     assert _encoder(described, {"link": -7.32, "motor": -7.36}) == "motor"
     assert _encoder(undescribed, {"link": -6.67, "motor": -7.01}) == "motor"
     assert _encoder(described, {"link": -7.0}) == "link"
+
+
+@pytest.mark.parametrize("encoder", ["link", "motor"])
+def test_a_joint_that_hardly_moves_is_known_as_stated(arm: NominalArm, encoder: Side) -> None:
+    stated, own = np.full(3, 1e-4), [np.array([1e-6, np.inf, np.inf])] * 2
+    found = as_stated(replace(arm, encoder=encoder, compliance=stated, stated=stated), [stated] * 2, own)
+    np.testing.assert_allclose(found.compliance_std, [1e-6 / np.sqrt(2.0), 0.5e-4, 0.5e-4])
 
 
 def test_sets_that_agree_know_a_stiffness_no_better_than_their_rows() -> None:
