@@ -114,7 +114,7 @@ def _show(title: str, found: Diagnosis, start: float) -> None:
         )
     for rest in found.unexplained:
         print(
-            f"  unexplained: {rest.side} torque of joint {rest.joint} depends on {', '.join(rest.depends_on)} "
+            f"  unexplained: {rest.side} torque of joint {rest.joint} depends on {', '.join(rest.depends_on) or '-'} "
             f"({rest.test_rms:.3g} Nm, floor {rest.noise_floor:.3g} Nm)"
         )
     for note in found.notes:

@@ -13,7 +13,7 @@ from ident.diagnosis.confidence import believable
 from ident.diagnosis.confirmation import FELT_POWER, confirmed, contradicted, doubted
 from ident.diagnosis.extension import Member, extension, power_left, title, titles
 from ident.diagnosis.findings import in_order, limit_findings, loss_finding, sizeless
-from ident.diagnosis.held_out import HeldOut, held_out, worse_rows
+from ident.diagnosis.held_out import BEYOND_HEALTHY, HeldOut, held_out, worse_rows
 from ident.diagnosis.models import changes_of, fitted_models, lasting, without_harm
 from ident.diagnosis.nominal import TRAVEL_RAD, Nominal
 from ident.diagnosis.payloads import unchecked_masses
@@ -96,6 +96,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         for r in remainders
         if (r.side, r.joint) not in fitted and r.inflation > FELT_POWER
     ]
+    left += _beyond_healthy(task, extended_rms, findings, told.added, left)
     replayed = list(task.test) or list(task.sessions)
     simulation = extended_simulation = None
     if task.simulate is not None:
@@ -255,6 +256,32 @@ def _stuck(nominal: Nominal) -> list[tuple[str, int, tuple[str, ...]]]:
     """Side, joint (from 1) and variable of motor torques with stuck values."""
     joints = {one.joint for r in nominal.recordings if not r.test for one in r.stuck}
     return [("motor", joint + 1, (f"load{joint + 1}",)) for joint in sorted(joints)]
+
+
+def _beyond_healthy(
+    task: Task,
+    left: Mapping[str, Floats],
+    findings: Sequence[Finding],
+    added: Sequence[str],
+    known: Sequence[tuple[str, int, tuple[str, ...]]],
+) -> list[tuple[str, int, tuple[str, ...]]]:
+    """Side and joint (from 1) of torques with an error far beyond that of the healthy days, of no known variable.
+
+    left : error of the extended model. A finding that the model does not hold, `added`, explains the error of its
+    joints. known : remainders of the same kind.
+    """
+    healthy = {} if task.reference is None else task.reference.left
+    open_ = [f.joints for f in findings if title({"cause": f.cause, "joints": f.joints}) not in added]
+    if () in open_:
+        return []
+    explained = {joint for joints in open_ for joint in joints}
+    told = {(side, joint) for side, joint, _ in known}
+    return [
+        (side, joint, ())
+        for side, usual in healthy.items()
+        for joint in (np.flatnonzero(left.get(side, np.nan) > BEYOND_HEALTHY * usual) + 1).tolist()
+        if joint not in explained and (side, joint) not in told
+    ]
 
 
 def _channel_notes(nominal: Nominal, remainders: Sequence[Remainder]) -> list[str]:

@@ -33,8 +33,6 @@ from lwr_driver.listing import Listing, Piece, text_of
 _MOST_ROWS = {"unexplained": 4, "absorbed": 5}
 _REPR_LINES = 10
 _AVOIDABLE_LOOK = 0.3
-# Share of power above the healthy error where the error is twice that.
-_TWICE = 0.75
 _WORSE_REPLAY = 1.1
 REPLAYED = (
     ("position", "position", "mrad", 1e3),
@@ -290,7 +288,9 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
         return "good", "No cause found beyond the character of such an arm, which the extended model now has"
     rest = [*content.get("nameless", []), *content.get("unexplained", [])]
     if rest:
-        of_time = all(one["depends_on"] == ["time"] for one in rest)
+        if not any(one["depends_on"] for one in rest):
+            return "look", "The data support no cause, but the error is far beyond that of the healthy days"
+        of_time = all(one["depends_on"] in ([], ["time"]) for one in rest)
         on = "change with the time and not with the motion" if of_time else "depend on the motion"
         return "look", f"The data support no cause, but the residuals {on}"
     rows = details.get("rows", [])
@@ -307,15 +307,11 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
 
 
 def _beyond_healthy(row: Plain) -> float:
-    """Share of power of the base model's error above the noise, and above its error on the healthy arm.
-
-    Without a repeated motion all of an error may pass for noise; twice that of the healthy arm is none.
-    """
+    """Share of power of the base model's error above the noise, and above its error on the healthy arm."""
     share, healthy = float(row["avoidable_share"]), row.get("healthy")
     if not healthy or row["test_rms_base"] <= 0.0:
         return share
-    above = 1.0 - float(healthy / row["test_rms_base"]) ** 2
-    return above if above > _TWICE else min(share, above)
+    return min(share, 1.0 - float(healthy / row["test_rms_base"]) ** 2)
 
 
 def _lines(
@@ -427,7 +423,7 @@ def _unexplained(content: Plain, names: Sequence[str]) -> Part:
     rows = [
         (
             f"{_name(entry['joint'], names)} {entry['side']}",
-            ", ".join(entry.get("depends_on", [])),
+            ", ".join(entry.get("depends_on", [])) or "no single variable",
             Number(entry.get("test_rms"), ".3g"),
             Number(entry.get("noise_floor"), ".3g"),
         )

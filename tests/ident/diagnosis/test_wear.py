@@ -110,6 +110,19 @@ def test_a_torque_of_no_name_bends_the_parameters_and_is_no_wear(
     assert any((u.side, u.joint) == ("motor", 2) for u in (*found.nameless, *found.unexplained))
 
 
+def test_an_error_far_beyond_that_of_the_healthy_days_is_unexplained_though_no_variable_explains_it(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    calm = {side: values.copy() for side, values in reference.left.items()}
+    calm["motor"][1] /= 5.0
+    found = diagnose(pair(make, seed=31), chain, reference=replace(reference, left=calm))
+    assert not found.findings
+    assert [(u.side, u.joint, u.depends_on) for u in found.unexplained] == [("motor", 2, ())]
+    assert "far beyond that of the healthy days" in str(found)
+    assert "no single variable" in str(found)
+    assert not diagnose(pair(make, seed=31), chain, reference=reference).unexplained
+
+
 def test_wear_is_no_part_of_the_extension(of_worn_arm: Diagnosis) -> None:
     found = of_worn_arm
     assert not any(name.startswith("wear") for name in found.extension)
