@@ -13,11 +13,11 @@ from ident.diagnosis.reference import (
     DELAY_STD_S,
     ELSE,
     USUAL,
-    USUAL_CHANGES,
     USUAL_DAYS,
     joint_of,
     symbol_of,
 )
+from ident.diagnosis.size import USUAL_CHANGES
 
 # Share of healthy sets with a row above the largest error of the healthy ones.
 _ABOVE = 0.05

@@ -10,12 +10,14 @@ from ident.diagnosis.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.score import Score
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.tolerances import HABITUAL, usual_change
-from ident.diagnosis.usual_sizes import Healthy
+from ident.diagnosis.usual_sizes import Healthy, UsualSize
 from ident.effects import Shape
 
 # Least and largest ratio of the information to that of the healthy sets: less of it makes no limit smaller, for what
 # the model lacks differs from motion to motion, too.
 _INFORMATION = (1.0, 25.0)
+# Largest share of a trial's gain that its shape has more than the nearest one of the grid, of the same size otherwise.
+_OF_SHAPE = 0.1
 
 
 def _counterpart(shape: str, here: Iterable[str], there: Iterable[str]) -> str:
@@ -64,9 +66,13 @@ class HealthyNull:
         more = trial.score.gain > self.limit(trial)
         usual = self.healthy.sizes.get(candidate.key)
         here = None if usual is None else self.dictionary.scored(candidate, usual[0].shape)
-        if usual is None or here is None:
+        if usual is None:
             return more
         size, limit = usual
+        if self._is_known(trial, size):
+            return False
+        if here is None:
+            return more
         change = size.beyond(here)
         other = trial.score.gain - max(here.gain, 0.0)
         # Days alike by chance have a limit below that of noise.
@@ -74,6 +80,19 @@ class HealthyNull:
         changed = change > 0.0 and change + other > limit
         scatter = self._in_these(candidate, size.scatter, size.shape, here)
         return changed or (more and not size.clear(here, scatter))
+
+    def _is_known(self, trial: Trial, size: UsualSize) -> bool:
+        """Whether a trial is a size that the healthy sets have as well, however little they show of it."""
+        candidate = trial.candidate
+        for shape in dict.fromkeys((self.dictionary.nearest(trial), size.shape)):
+            known = size.known.get(shape)
+            here = None if known is None else self.dictionary.scored(candidate, shape)
+            if known is None or here is None or not known.holds(here):
+                continue
+            other = trial.score.gain - max(here.gain, 0.0)
+            if other <= max(_OF_SHAPE * trial.score.gain, self.least(candidate, here)):
+                return True
+        return False
 
     def least(self, candidate: Candidate, score: Score) -> float:
         """Least gain of a claim."""

@@ -35,8 +35,6 @@ INERTIA_BY_PHASE = 0.05
 """Largest effect of the phase of slow motor samples on a drive's inertia, as a share of it."""
 USUAL_DAYS = 4
 """Weight of the usual deviation of a delay, in days."""
-USUAL_CHANGES = 2.0
-"""Weight of the usual change of a parameter, a gain or the size of an effect beside this arm's own, in changes."""
 USUAL = {"Fvl": 0.087, "Fcl": 0.058, "Fvm": 0.087, "Fcm": 0.058}
 """Usual relative standard deviation of a healthy arm's parameters from day to day, by symbol: Coulomb friction within
 10 % and viscous friction within 15 %, evenly."""

@@ -15,8 +15,8 @@ from ident.diagnosis.candidates import Candidate, Dictionary
 from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.products import Rows
-from ident.diagnosis.reference import USUAL_CHANGES
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.diagnosis.size import USUAL_CHANGES
 from ident.effects import (
     DELAYS,
     ELASTICITY,

@@ -1,7 +1,9 @@
 """The size of each candidate on the healthy arm: its mean over the healthy sets, and how much a set differs from it.
 
 A base model is never quite the arm. What it lacks has the same size on each day, and a gain of its own: no change, and
-no measure of changes. So a candidate is also held against its mean size, by the scatter around it alone.
+no measure of changes. So a candidate is also held against its mean size, by the scatter around it alone. Where the
+motions of the healthy sets show little of it they have hardly a gain, but their size may be that of the present
+sessions all the same.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from fri.errors import ConfigurationError
 from ident.diagnosis.candidates import Dictionary
 from ident.diagnosis.products import Floats
 from ident.diagnosis.score import Score
+from ident.diagnosis.size import Size
 from ident.effects import find_effect
 from ident.estimators.estimate import fisher_limit
 
@@ -25,6 +28,8 @@ _THERE = 9.0
 _LEAST_SETS = 2
 # Largest change of a size from day to day as a share of it: three standard deviations of friction's.
 _LARGEST_SHARE = 0.3
+# The same in standard deviations.
+_LARGEST = 3.0
 
 _Any = TypeVar("_Any")
 Key = tuple[str, int]
@@ -34,29 +39,74 @@ Table = Mapping[Key, Mapping[str, Score]]
 
 
 @dataclass(frozen=True, eq=False)
+class KnownSize:
+    """A size other than zero in the healthy sets. mean : (k,) coefficients. covariance : (k, k) of the size on a
+    further day, but for the error of that day's own estimate.
+    """
+
+    mean: Floats
+    covariance: Floats
+
+    @classmethod
+    def of(cls, scores: Sequence[Score], usual: float) -> KnownSize | None:
+        """From the scores of a shape in the sets; None for a size that may be zero. usual : as of `Size.of`."""
+        size = Size.of([one.coefficients for one in scores], [one.covariance for one in scores], usual)
+        k = len(size.mean)
+        covariance = size.covariance + np.eye(k) * size.from_set_to_set**2 / k
+        square = float(size.mean @ np.linalg.pinv(covariance) @ size.mean)
+        return cls(size.mean, covariance) if square > _LARGEST**2 * k else None
+
+    def stored(self) -> dict[str, Any]:
+        """Plain content."""
+        return {"mean": _rounded(self.mean), "covariance": [_rounded(row) for row in self.covariance]}
+
+    @classmethod
+    def read(cls, content: Mapping[str, Any]) -> KnownSize:
+        """From plain content."""
+        mean, covariance = _coefficients(content["mean"]), np.array(content["covariance"], dtype=np.float64)
+        if covariance.shape != (len(mean), len(mean)):
+            raise ConfigurationError(
+                f"covariance of shape {covariance.shape} for {len(mean)} coefficients; commission the arm again"
+            )
+        return cls(mean, covariance)
+
+    def holds(self, score: Score) -> bool:
+        """Whether the coefficients of a score are this size, within all uncertainties and the usual changes."""
+        if score.coefficients.shape != self.mean.shape:
+            return False
+        share = _LARGEST_SHARE / _LARGEST
+        covariance = self.covariance + score.covariance + share**2 * np.outer(self.mean, self.mean)
+        away = score.coefficients - self.mean
+        return float(away @ np.linalg.pinv(covariance) @ away) <= _LARGEST**2 * len(away)
+
+
+@dataclass(frozen=True, eq=False)
 class UsualSize:
     """A candidate on the healthy arm.
 
     shape : of its grid, as text. mean : (k,) coefficients. scatter : gain of a set's difference from the mean size,
-    its unbiased mean square.
+    its unbiased mean square. known : sizes clearly other than zero, by shape of the grid.
     """
 
     shape: str
     mean: Floats
     scatter: float
+    known: Mapping[str, KnownSize] = field(default_factory=dict)
 
     def stored(self) -> dict[str, Any]:
         """Plain content."""
-        mean = [float(f"{value:.6g}") for value in self.mean]
-        return {"shape": self.shape, "mean": mean, "scatter": round(float(self.scatter), 2)}
+        return {
+            "shape": self.shape,
+            "mean": _rounded(self.mean),
+            "scatter": round(float(self.scatter), 2),
+            "known": {shape: one.stored() for shape, one in self.known.items()},
+        }
 
     @classmethod
     def read(cls, content: Mapping[str, Any]) -> UsualSize:
         """From plain content."""
-        mean = np.array(content["mean"], dtype=np.float64)
-        if mean.ndim != 1 or not len(mean):
-            raise ConfigurationError(f"mean size {content['mean']!r:.40}: give a list of numbers")
-        return cls(str(content["shape"]), mean, float(content["scatter"]))
+        known = {shape: KnownSize.read(one) for shape, one in content.get("known", {}).items()}
+        return cls(str(content["shape"]), _coefficients(content["mean"]), float(content["scatter"]), known)
 
     def change(self, score: Score) -> float:
         """Gain of a score's difference from the mean size, in its shape."""
@@ -137,8 +187,26 @@ def usual_sizes(sets: Sequence[Table]) -> dict[Key, UsualSize]:
             here = table[best]
             largest = max(max(score.gain, 0.0) for score in table.values())
             total += max(largest - max(here.gain, 0.0) + size.change(here), 0.0)
-        found[key] = UsualSize(best, mean, total / (len(sets) - 1))
+        usual = find_effect(key[0]).usual_change
+        known = {shape: KnownSize.of([table[shape] for table in tables], usual) for shape in shapes}
+        found[key] = UsualSize(
+            best,
+            mean,
+            total / (len(sets) - 1),
+            {shape: one for shape, one in known.items() if one is not None},
+        )
     return found
+
+
+def _rounded(values: Floats) -> list[float]:
+    return [float(f"{value:.6g}") for value in values]
+
+
+def _coefficients(content: Any) -> Floats:
+    values = np.array(content, dtype=np.float64)
+    if values.ndim != 1 or not len(values):
+        raise ConfigurationError(f"mean size {content!r:.40}: give a list of numbers")
+    return values
 
 
 def independent(key: Key, own: float, with_joints: float) -> float:

@@ -95,6 +95,35 @@ def test_a_constant_misfit_hides_no_change_of_the_same_candidate() -> None:
     assert not HealthyNull(dictionary, DiagnosisSettings(), Healthy({KEY: 1000.0})).exceeded(trial)  # type: ignore[arg-type]
 
 
+def test_a_size_that_healthy_sets_hardly_show_is_no_change_where_it_is_the_same() -> None:
+    """0.11 and 0.12 of a spring with a deviation of 0.03 each have hardly a gain; 0.115 elsewhere has a large one."""
+    tables = [{KEY: {"v": score(value, information=1e3), "w": score(0.02)}} for value in (0.11, 0.12)]
+    size = usual_sizes(tables)[KEY]
+    assert set(size.known) == {"v"}
+    again = UsualSize.read(size.stored())
+    assert again.known["v"].covariance == pytest.approx(size.known["v"].covariance)
+
+    def exceeded(value: float, *, nearest: float | None = None) -> bool:
+        """A trial of this size; nearest : the size in the nearest shape of the grid, of another gain."""
+        here = score(value if nearest is None else nearest, information=1e5)
+        trial = Trial(Candidate(EFFECTS[KEY[0]], 0), Shape(velocity=0.05), score(value, information=1e5), {})
+        dictionary = SimpleNamespace(
+            nearest=lambda trial: "v",
+            information=lambda candidate: {"v": 1e5},
+            scored=lambda candidate, shape: here if shape == "v" else None,
+        )
+        other = replace(again, shape="x", scatter=1.0)
+        healthy = Healthy({KEY: 1.0}, {KEY: {"v": 1e3}}, {KEY: (other, 1.0)})
+        return HealthyNull(dictionary, DiagnosisSettings(), healthy).exceeded(trial)  # type: ignore[arg-type]
+
+    assert not exceeded(0.115)
+    assert not exceeded(0.16)
+    assert exceeded(0.25)
+    assert exceeded(-0.115)
+    # A gain that the shape of the healthy sets does not have is a cause of its own.
+    assert exceeded(0.16, nearest=0.115)
+
+
 def test_a_claim_by_its_change_alone_is_no_plain_one() -> None:
     claim = Claim(Trial(Candidate(EFFECTS["stribeck"], 0), Shape(velocity=0.05), score(2.0), {}), score(2.0))
     grounds = Grounds(3.0, 9.0, 4.0, 3.0, 0.0, 0.2, 0.0, 0.0)
