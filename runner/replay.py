@@ -59,7 +59,7 @@ _AROUND_NS = 5_000_000_000
 _LED_HZ, _HELD_HZ = 20.0, 3.0
 # Speed below which a drive may stick [rad/s], and time around it [s]: positions then tell nothing of the friction.
 _SLOW, _AROUND_S = 0.01, 0.05
-# Joints of unknown stiffness ring at this frequency, with this damping ratio.
+# Joints of unknown stiffness, and rigid ones, ring at this frequency, with this damping ratio.
 _STIFF_HZ, _DAMPING = 40.0, 0.03
 # Drives of a model without motor side: inertia over that of the links.
 _ROTOR = 0.3
@@ -96,7 +96,7 @@ class Replayed:
 class Replay:
     """Replays sessions; call it with a model and sessions.
 
-    stiffness : (n,) of the joints [Nm/rad], None: stiff ones. sessions : all of the diagnosis, for their numbers.
+    stiffness : (n,) of the joints [Nm/rad], as of `replay`. sessions : all of the diagnosis, for their numbers.
     longest_s : longest simulated part of a session, extended for an effect at a later moment. encoder : side of the
     elastic joints with the published positions. first : by call, the first replayed session and its replay.
     """
@@ -197,8 +197,9 @@ def replay(
 ) -> Replayed:
     """Simulate a session from the beginning of its excitation.
 
-    stiffness : (n,) of the joints [Nm/rad], None: stiff ones. encoder : side with the published positions. number : of
-    the session in the diagnosis, from 0. inertia : (n,) of spring and damper [kg m^2]; None: of this model.
+    stiffness : (n,) of the joints [Nm/rad], infinite for a stiff one, None: all stiff. encoder : side with the
+    published positions. number : of the session in the diagnosis, from 0. inertia : (n,) of spring and damper
+    [kg m^2]; None: of this model.
     Raises DataError for a model of no possible arm, and for a session without positions.
     """
     chosen = session.select(model.structure.chain.joint_names)
@@ -291,7 +292,8 @@ class _Bench:
         mass = np.asarray(masses.mean(axis=0))
         if "motor" not in model.structure.sides:
             drive = replace(drive, Ia=_ROTOR * mass)
-        hard = masses.max(axis=0) * (2.0 * np.pi * _STIFF_HZ) ** 2 if stiffness is None else stiffness
+        hard = masses.max(axis=0) * (2.0 * np.pi * _STIFF_HZ) ** 2
+        hard = hard if stiffness is None else np.where(np.isfinite(stiffness), stiffness, hard)
         self.drive = replace(drive, stiffness=hard, damping=2.0 * _DAMPING * np.sqrt(hard * mass))
         self.inertia = mass + drive.Ia if inertia is None else inertia
 

@@ -244,9 +244,11 @@ def _unadvised() -> Iterator[None]:
 
 
 def _stiffness(arm: Arm | None, healthy: Reference | None) -> NDArray[np.float64] | None:
-    """Of the joints (n,) [Nm/rad], from the reference or from the description of the arm; None if unknown."""
-    if healthy is not None and len(healthy.compliance) and np.all(healthy.compliance > 0.0):
-        return np.asarray(1.0 / healthy.compliance)
+    """Of the joints (n,) [Nm/rad], infinite for a rigid one, from the reference or from the description of the arm;
+    None if unknown."""
+    if healthy is not None and np.any(healthy.compliance > 0.0):
+        with np.errstate(divide="ignore"):
+            return np.asarray(1.0 / healthy.compliance)
     return None if arm is None else np.asarray(arm.stiffness, dtype=float)
 
 

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ident.diagnosis import SimulationError
+from ident.diagnosis import Reference, SimulationError
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
+from runner.diagnosis.study import _stiffness
 from runner.replay import METHOD, Replay
 from tests.hidden_physics.engine import REFERENCE
 from tests.hidden_physics.motions import exciting_motion
@@ -142,6 +143,25 @@ def test_without_motor_torques_there_is_no_simulated_position(
     told = " ".join(follower.notes)
     assert "no simulated position" in told
     assert "stiffness of the joints is unknown" in told
+
+
+def test_a_rigid_joint_among_elastic_ones_is_a_stiff_spring(
+    models: tuple[DynamicModel, DynamicModel], sessions: Mapping[str, Session]
+) -> None:
+    session, springs = sessions["nominal"], Arm.load().stiffness
+    mixed = np.where(np.arange(len(springs)) < 3, springs, np.inf)
+    runs = [
+        Replay(chosen, [session], longest_s=2.0) for chosen in (mixed, np.full(len(springs), np.inf), None)
+    ]
+    left = [of(error, "motor") for run in runs if (error := run(models[0], [session])) is not None]
+    np.testing.assert_array_equal(left[1], left[2])
+    assert np.isfinite(left[0]).all()
+    assert not np.array_equal(left[0], left[1])
+
+
+def test_a_reference_with_a_rigid_joint_gives_the_springs_of_the_others() -> None:
+    healthy = replace(Reference.of(read_model(REFERENCE)), compliance=np.array([1e-4, 0.0]))
+    np.testing.assert_allclose(_stiffness(Arm.load(), healthy), [1e4, np.inf])
 
 
 def test_published_motor_positions_are_led_to_the_same_torques(
