@@ -29,6 +29,7 @@ from ident.diagnosis.products import (
     block_sums,
     inverse_of,
     left_beside,
+    scale_of,
     schur,
     width_of,
 )
@@ -190,8 +191,7 @@ class Evidence:
                     cross = self._cross(padded, self._known[id(other)][1])
                     self.gram[:, here, there] = cross
                     self.gram[:, there, here] = cross.transpose(0, 2, 1)
-        scale = np.sqrt(np.einsum("bii->i", self.gram))
-        self._scale = np.where(scale > 0.0, 1.0 / np.where(scale > 0.0, scale, 1.0), 0.0)
+        self._scale = scale_of(np.einsum("bii->i", self.gram))
         self._part_gram, self._part_target = block_sums(self.parts, self.gram), self.parts @ self.target
         gram, target = self._part_gram.sum(axis=0), self._part_target.sum(axis=0)
         self.full = self._fit(gram, target)
@@ -310,7 +310,7 @@ class Evidence:
         gram = self._base_gram.sum(axis=0)
         if self.prior is not None:
             gram = gram + self.prior[0]
-        return inverse_of(gram, 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300)))
+        return inverse_of(gram, scale_of(np.diag(gram)))
 
     # ---- scores ----
 

@@ -69,6 +69,12 @@ def width_of(rows: Rows) -> int:
     return next((columns.shape[1] for columns in rows.values()), 0)
 
 
+def scale_of(squares: Floats) -> Floats:
+    """Factors (P,) to a diagonal of ones from its squares (P,), 0 for a column without any."""
+    some = squares > 0.0
+    return np.where(some, 1.0 / np.sqrt(np.where(some, squares, 1.0)), 0.0)
+
+
 def inverse_of(gram: Floats, scale: Floats) -> Floats:
     """Inverse (P, P) of products scaled to a diagonal near one."""
     both = np.outer(scale, scale)
