@@ -129,12 +129,12 @@ def sizeless(finding: Finding) -> bool:
     """Whether no parameter that its torque is proportional to is told from zero: its torque is there beyond chance, but
     a time constant or a shape trades with its size, or its parts cancel. That is no change of an arm.
 
-    Look-alikes have a size between them, and so have the ways of a friction to reverse, beside which one is estimated.
+    Look-alikes have a size between them.
     """
-    effect = EFFECTS[finding.cause]
-    if finding.alternatives or effect.beside_companions:
+    if finding.alternatives:
         return False
-    sizes = [finding.parameters[p.name] for p in effect.linear if p.name in finding.parameters]
+    linear = EFFECTS[finding.cause].linear
+    sizes = [finding.parameters[p.name] for p in linear if p.name in finding.parameters]
     return bool(sizes) and not any(abs(one.value) > _TOLD * one.std for one in sizes)
 
 

@@ -62,6 +62,8 @@ def test_held_out_data_refute_no_event_and_nothing_that_they_hardly_excite() -> 
             {"stiffness": (0.06, 0.01), "quadratic": (-0.04, 0.03), "cubic": (0.009, 0.005)},
             True,
         ),
+        ("stribeck", {"amplitude": (2.4, 2.0), "velocity": (0.06, 0.01), "exponent": (3.0, 1.9)}, False),
+        ("stribeck", {"amplitude": (0.6, 0.1), "velocity": (0.06, 0.01), "exponent": (3.0, 1.9)}, True),
         # Its one parameter is a shape.
         ("joint_torque_delay", {"delay": (0.0005, 0.001)}, True),
     ],
