@@ -16,7 +16,7 @@ _DRAWS = 1000
 FELT_WORSE = 0.01
 """A rise of an error by a smaller share is felt by nobody, however sure: all rows share base parameters."""
 BEYOND_HEALTHY = 1.5
-"""Error over the largest that the healthy arm left in a session, hardly reached by other motions and loads."""
+"""Error over that which 19 of 20 healthy days stay below, hardly reached by other motions and loads."""
 # A rise beyond this counts, though it came from a single block.
 _MUCH_WORSE = 0.05
 
