@@ -54,7 +54,7 @@ _LEFT_OUT = (
     "_LATEST",
 )
 _IN_WORDS = ("claims_in_words", "look_alikes", "statements")
-_OF_REFERENCE = ("character", "commission")
+_OF_REFERENCE = ("character", "commission", "size", "usual_sizes")
 
 
 @dataclass(frozen=True)
