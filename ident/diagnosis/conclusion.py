@@ -36,7 +36,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
     evidence, nominal = bench.evidence, bench.nominal
     baseline = state.baseline if state.timing else None
     baseline = baseline or Baseline.of(bench, nuisance, lasting(state.selection))
-    kept = [one for one in confirmed(task, state) if not is_level(one.claim)]
+    borne_out, refuted = confirmed(task, state)
+    kept = [one for one in borne_out if not is_level(one.claim)]
     evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])
     remainders = find_remainders(bench.dictionary, evidence, settings, task.limits)
     findings = doubted(task, state, kept, remainders)
@@ -87,7 +88,11 @@ def conclude(task: Task, state: State) -> Diagnosis:
     if losses:
         findings.append(loss_finding(losses[0]))
     findings += limit_findings(nominal.recordings, findings)
-    doubts = [d for d in doubts if not any((d.cause, d.joints) == (f.cause, f.joints) for f in findings)]
+    doubts = [
+        d
+        for d in (*doubts, *refuted)
+        if not any((d.cause, d.joints) == (f.cause, f.joints) for f in findings)
+    ]
     findings = in_order(sorted(findings, key=lambda f: -f.gain), evidence.floor)
     fitted = {(term.side, term.joint) for term in told.nameless}
     extended_rms = told.after.rms()

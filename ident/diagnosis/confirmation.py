@@ -52,8 +52,8 @@ class Confirmed:
     most: float
 
 
-def confirmed(task: Task, state: State) -> list[Confirmed]:
-    """The claims of a selection not refuted by held-out rows.
+def confirmed(task: Task, state: State) -> tuple[list[Confirmed], list[Finding]]:
+    """The claims of a selection not refuted by held-out rows, and findings of the others, of confidence zero.
 
     A deviation of the healthy arm, or the error of a stronger cause's law, is significant in the rows fitted but
     predicts nothing.
@@ -62,7 +62,7 @@ def confirmed(task: Task, state: State) -> list[Confirmed]:
     claims = state.selection.claims
     rows_of = [c.trial.rows for c in claims]
     after = held_out(bench.evidence, [*rows_of, *nuisance])
-    kept = []
+    kept, refuted = list[Confirmed](), list[Finding]()
     for k, claim in enumerate(claims):
         without = held_out(bench.evidence, [*(r for i, r in enumerate(rows_of) if i != k), *nuisance])
         finding = finding_of(claim, bench, without, after, seed)
@@ -70,12 +70,13 @@ def confirmed(task: Task, state: State) -> list[Confirmed]:
         fallen = fall(without, after, weights, seed)
         hardly = _excitation(claim, bench) < _EXCITED
         if _refuted(claim, finding, bench, fallen, hardly):
+            refuted.append(replace(finding, confidence=0.0))
             continue
         untested = _untested(claim) or hardly
         grounds = _grounds(claim, claims, finding, bench, without, after, fallen, untested, seed)
         most = 1.0 if _plain(claim, finding, bench, grounds, fallen) else _OPEN
         kept.append(Confirmed(claim, finding, grounds, most))
-    return kept
+    return kept, refuted
 
 
 def doubted(

@@ -186,9 +186,9 @@ class Diagnosis(Tabular):
     """Everything that was found; prints itself.
 
     findings : changes against the reference, or what no healthy arm of the kind has. character : what every such drive
-    has and the base model lacks. doubted : names more likely wrong than right. nameless : fitted terms without a name.
-    unexplained : remainders that could not be fitted. extension : `cause(joints)` of all in the extended model,
-    `cause(joint: variable)` of a term without a name.
+    has and the base model lacks. doubted : names more likely wrong than right, with confidence 0 those that held-out
+    rows refute. nameless : fitted terms without a name. unexplained : remainders that could not be fitted.
+    extension : `cause(joints)` of all in the extended model, `cause(joint: variable)` of a term without a name.
     base_model, extended_model : fitted to the training sessions, without and with the findings' effects.
     changes : change of the base parameters by the extension, in their standard deviations.
     rms_base, rms_extended : rms error (n,) [Nm] by side in the held-out rows, beside the noise_floor of these rows.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ident.diagnosis import diagnose
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.confirmation import _refuted
 from ident.diagnosis.findings import sizeless
@@ -16,7 +18,9 @@ from ident.diagnosis.result import Evident, Finding, Value
 from ident.diagnosis.score import Score
 from ident.diagnosis.selection import Claim
 from ident.diagnosis.settings import DiagnosisSettings
+from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, Shape
+from lwr_driver.session import Session
 
 BENCH: Any = SimpleNamespace(evidence=SimpleNamespace(settings=DiagnosisSettings()))
 
@@ -76,3 +80,20 @@ def test_a_cause_of_no_size_is_no_finding(
     finding = Finding(cause, "motor", (1,), values, evident, 0.9, (), "", 50.0)
     assert sizeless(finding) != told
     assert not sizeless(replace(finding, alternatives=(("contact", (), -40.0),)))
+
+
+def test_a_cause_that_held_out_sessions_refute_is_listed_among_the_doubted(
+    make: Callable[..., Session], chain: Chain
+) -> None:
+    """A spring at the second joint while the sessions of the fit were recorded, and none in the held-out one."""
+
+    def hose(s: dict[str, np.ndarray]) -> None:
+        torque = 6.0 * s["q"][:, 1]
+        s["joint"][:, 1] += torque
+        s["motor"][:, 1] += torque
+
+    sprung = [make("a.mcap", 1, hose), make("b.mcap", 2, hose, 1)]
+    found = diagnose(sprung, chain, test=[make("c.mcap", 3, None)])
+    refuted = [f for f in found.doubted if f.confidence == 0.0]
+    assert [(f.cause, f.joints) for f in refuted] == [("cable_spring", (2,))]
+    assert not any(f.cause == "cable_spring" for f in found.claims)
