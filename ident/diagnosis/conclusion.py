@@ -101,7 +101,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         for r in remainders
         if (r.side, r.joint) not in fitted and r.inflation > FELT_POWER
     ]
-    left += _beyond_healthy(task, extended_rms, findings, told.added, left)
+    left += _beyond_healthy(task, told.before.rms(), extended_rms, findings, told.added, left)
     replayed = list(task.test) or list(task.sessions)
     simulation = extended_simulation = None
     if task.simulate is not None:
@@ -265,15 +265,17 @@ def _stuck(nominal: Nominal) -> list[tuple[str, int, tuple[str, ...]]]:
 
 def _beyond_healthy(
     task: Task,
-    left: Mapping[str, Floats],
+    before: Mapping[str, Floats],
+    after: Mapping[str, Floats],
     findings: Sequence[Finding],
     added: Sequence[str],
     known: Sequence[tuple[str, int, tuple[str, ...]]],
 ) -> list[tuple[str, int, tuple[str, ...]]]:
     """Side and joint (from 1) of torques with an error far beyond that of the healthy days, of no known variable.
 
-    left : error of the extended model. A finding that the model does not hold, `added`, explains the error of its
-    joints. known : remainders of the same kind.
+    before, after : errors of base and extended model. Less than the extension takes off an error is that of its laws. A
+    finding that the extension, `added`, does not hold explains the error of its joints. known : remainders of the same
+    kind.
     """
     healthy = {} if task.reference is None else task.reference.left
     open_ = [f.joints for f in findings if title({"cause": f.cause, "joints": f.joints}) not in added]
@@ -281,12 +283,15 @@ def _beyond_healthy(
         return []
     explained = {joint for joints in open_ for joint in joints}
     told = {(side, joint) for side, joint, _ in known}
-    return [
-        (side, joint, ())
-        for side, usual in healthy.items()
-        for joint in (np.flatnonzero(left.get(side, np.nan) > BEYOND_HEALTHY * usual) + 1).tolist()
-        if joint not in explained and (side, joint) not in told
-    ]
+    found: list[tuple[str, int, tuple[str, ...]]] = []
+    for side, usual in healthy.items():
+        if side not in after:
+            continue
+        far = after[side] > BEYOND_HEALTHY * usual
+        far &= after[side] ** 2 - usual**2 > before[side] ** 2 - after[side] ** 2
+        joints = (np.flatnonzero(far) + 1).tolist()
+        found += [(side, j, ()) for j in joints if j not in explained and (side, j) not in told]
+    return found
 
 
 def _channel_notes(nominal: Nominal, remainders: Sequence[Remainder]) -> list[str]:
