@@ -100,7 +100,8 @@ def doubted(
         )
         # No held-out session confirms a change between sessions, and a dependence on the motion is similar to one.
         like = claim.trial.passing and bool(unnamed & mine)
-        open_ = like or grounds.replaceable > _REPLACEABLE or _bent(claim, remainders)
+        strange = not claim.trial.candidate.effect.known_of_drives(claim.trial.shape)
+        open_ = like or strange or grounds.replaceable > _REPLACEABLE or _bent(claim, remainders)
         most = min(one.most, claim.confidence, _OPEN if open_ else 1.0)
         findings.append(
             replace(one.finding, confidence=min(most, probability(grounds)), grounds=grounds.to_dict())

@@ -388,6 +388,10 @@ class Effect(ABC):
         """Whether the coefficients lie in their physically sensible ranges."""
         return all(p.low <= value <= p.high for p, value in zip(self.linear, coefficients, strict=False))
 
+    def known_of_drives(self, shape: Shape) -> bool:
+        """Whether drives are known with such a shape; another one fits a torque of another cause."""
+        return True
+
     def seen_in_samples(self, shape: Shape) -> bool:
         """Whether the samples themselves show the cause, without a test of significance by blocks."""
         return False

@@ -37,6 +37,10 @@ def dahl_step(run: Simulated, here: float, length: float) -> float:
     return float(run.state[0])
 
 
+# Longest way in which the friction of a drive is known to turn [rad].
+_LONGEST = 0.1
+
+
 class _Turning(Form):
     SMOOTH = "smooth in speed", "amplitude", "velocity"
 
@@ -68,10 +72,14 @@ class PreslidingHysteresis(Effect):
     tell_apart = "reversals of joint {joint} at three accelerations and amplitudes (0.5, 2 and 10 mrad)"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """From half a milliradian, or ten times the presliding length of the model, to a tenth of a radian."""
+        """From half a milliradian, or ten times the presliding length of the model, to more than of any drive."""
         least = self.least(setting, joint).get("length", 0.0)
         lengths = [Shape(length=x) for x in (5e-4, 1.5e-3, 5e-3, 1.5e-2, 5e-2, 0.15) if x >= least]
         return [*lengths, *(Shape(_Turning.SMOOTH, velocity=v) for v in (0.01, 0.025, 0.06))]
+
+    def known_of_drives(self, shape: Shape) -> bool:
+        """Whether it turns over a tenth of a radian at most: what lasts longer is a memory of the speed."""
+        return shape.get("length", 0.0) <= _LONGEST
 
     def least(self, setting: Setting, joint: int) -> Mapping[str, float]:
         """A length near that of the healthy drive is a small change of the latter, not another friction; a film that

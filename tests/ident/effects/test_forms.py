@@ -115,6 +115,13 @@ def test_a_saturating_constant_reads_the_more_too_much_the_larger_the_torque() -
     assert not gain.plausible(np.array([0.1, -1e-3]), saturating)
 
 
+def test_friction_that_turns_over_twenty_degrees_is_no_presliding_of_a_drive() -> None:
+    known = EFFECTS["presliding_hysteresis"].known_of_drives
+    assert known(Shape(length=0.02))
+    assert not known(Shape(length=0.37))
+
+
+
 def test_smooth_friction_is_none_at_standstill_and_whole_at_speed() -> None:
     film, here = EFFECTS["presliding_hysteresis"], motion()
     values = {"amplitude": 1.0, "velocity": 0.02}
