@@ -101,7 +101,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         for r in remainders
         if (r.side, r.joint) not in fitted and r.inflation > FELT_POWER
     ]
-    left += _beyond_healthy(task, told.before.rms(), extended_rms, findings, told.added, left)
+    left += _beyond_healthy(task, told.before.rms(), extended_rms, evidence.floor, findings, told.added, left)
     replayed = list(task.test) or list(task.sessions)
     simulation = extended_simulation = None
     if task.simulate is not None:
@@ -267,6 +267,7 @@ def _beyond_healthy(
     task: Task,
     before: Mapping[str, Floats],
     after: Mapping[str, Floats],
+    noise: Mapping[str, Floats],
     findings: Sequence[Finding],
     added: Sequence[str],
     known: Sequence[tuple[str, int, tuple[str, ...]]],
@@ -274,8 +275,9 @@ def _beyond_healthy(
     """Side and joint (from 1) of torques with an error far beyond that of the healthy days, of no known variable.
 
     before, after : errors of base and extended model. Less than the extension takes off an error is that of its laws. A
-    finding that the extension, `added`, does not hold explains the error of its joints. known : remainders of the same
-    kind.
+    finding that the extension, `added`, does not hold explains the error of its joints. noise : of these rows; without
+    a repeated motion all of an error may pass for it, but twice that of the healthy days is none. known : remainders of
+    the same kind.
     """
     healthy = {} if task.reference is None else task.reference.left
     open_ = [f.joints for f in findings if title({"cause": f.cause, "joints": f.joints}) not in added]
@@ -287,7 +289,8 @@ def _beyond_healthy(
     for side, usual in healthy.items():
         if side not in after:
             continue
-        far = after[side] > BEYOND_HEALTHY * usual
+        least, most = BEYOND_HEALTHY
+        far = after[side] > np.clip(noise[side], least * usual, most * usual)
         far &= after[side] ** 2 - usual**2 > before[side] ** 2 - after[side] ** 2
         joints = (np.flatnonzero(far) + 1).tolist()
         found += [(side, j, ()) for j in joints if j not in explained and (side, j) not in told]

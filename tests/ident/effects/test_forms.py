@@ -121,7 +121,6 @@ def test_friction_that_turns_over_twenty_degrees_is_no_presliding_of_a_drive() -
     assert not known(Shape(length=0.37))
 
 
-
 def test_smooth_friction_is_none_at_standstill_and_whole_at_speed() -> None:
     film, here = EFFECTS["presliding_hysteresis"], motion()
     values = {"amplitude": 1.0, "velocity": 0.02}
