@@ -95,12 +95,9 @@ class UsualSize:
 
     def stored(self) -> dict[str, Any]:
         """Plain content."""
-        return {
-            "shape": self.shape,
-            "mean": _rounded(self.mean),
-            "scatter": round(float(self.scatter), 2),
-            "known": {shape: one.stored() for shape, one in self.known.items()},
-        }
+        known = {shape: one.stored() for shape, one in self.known.items()}
+        content = {"shape": self.shape, "mean": _rounded(self.mean), "scatter": round(float(self.scatter), 2)}
+        return content | ({"known": known} if known else {})
 
     @classmethod
     def read(cls, content: Mapping[str, Any]) -> UsualSize:
