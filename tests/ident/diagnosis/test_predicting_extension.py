@@ -145,15 +145,17 @@ def test_where_no_extension_predicts_better_nothing_says_that_there_is_one(
     logs = [make(f"{k}.mcap", seed, three_errors, k) for k, seed in enumerate((1, 2, 5))]
     told = diagnose(logs[:2], chain, test=logs[2:], causes=["cable_spring", "friction_asymmetry"])
     fitted, left = ([(one.side, one.joint) for one in part] for part in (told.nameless, told.unexplained))
+    # Beside those that the held-out rows refute.
+    doubted = [(f.cause, f.confidence <= 0.7) for f in told.doubted if f.confidence > 0.0]
     if not harmful:
         assert {"cable_spring(3)", "friction_asymmetry(1)"} < set(told.extension)
         assert ("motor", 2) in fitted
         assert ("motor", 2) not in left
-        assert not told.doubted
+        assert not doubted
         return
     assert (fitted, told.extension) == ([], ())
     assert told.extended_model is told.base_model
     assert ("motor", 2) in left
     # The name of a fault is contradicted; what every such drive has is only not in the model.
-    assert [(f.cause, f.confidence <= 0.7) for f in told.doubted] == [("cable_spring", True)]
+    assert doubted == [("cable_spring", True)]
     assert [(f.cause, f.confidence <= 0.7) for f in told.character] == [("friction_asymmetry", True)]
