@@ -516,6 +516,7 @@ def test_json_of_recover_attach_and_export(workplace: Callable[[], Path]) -> Non
     assert [entry["format"] for entry in json.loads(text)["files"]] == ["URDF", "C"]
 
 
+@pytest.mark.slow
 def test_options_of_commands_for_logs(workplace: Callable[[], Path]) -> None:
     place = workplace()
     (place / "other" / "loaded.plain.mcap").rename(place / "bare.mcap")
@@ -539,6 +540,7 @@ def test_options_of_commands_for_logs(workplace: Callable[[], Path]) -> None:
     assert 'width="283.46' in files[0].read_text()
 
 
+@pytest.mark.slow
 def test_options_of_commands_for_models(workplace: Callable[[], Path]) -> None:
     place = workplace()
     assert run("export", "model.yaml", "out.c", "--name", "bench", "--payload", "paper_load")[0] == 0

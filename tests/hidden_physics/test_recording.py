@@ -39,6 +39,7 @@ def log(order: Order) -> Path:
     return record(order)
 
 
+@pytest.mark.slow
 def test_processes_over_udp_give_the_same_file(order: Order, log: Path) -> None:
     other = dataclasses.replace(order, path=log.with_name("processes.mcap"))
     record_by_processes(other)

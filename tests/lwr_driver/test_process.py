@@ -296,6 +296,7 @@ def test_loop_that_dies_is_a_network_error(lab):
     driver.close()
 
 
+@pytest.mark.slow
 def test_emulator_that_is_gone_is_noticed(lab):
     driver, lab.spoiled = lab.command(), True
     outcome = lab.interrupted(lab.emulator.stop)

@@ -115,6 +115,7 @@ def test_a_reader_that_stops_reading_is_no_error() -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_a_module_of_that_name_beside_the_experiment_is_not_read(tmp_path: Path) -> None:
     for name in ("numbers", "json", "signal"):
         (tmp_path / f"{name}.py").write_text("raise RuntimeError('read by a child process')")

@@ -62,6 +62,7 @@ def _drive(path: Path, fault: dict[str, Any], *, hosting: bool) -> str:
     return digest.hexdigest()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_both_transports_give_the_same_messages_and_times(tmp_path: Path, fault: str) -> None:
     ways = {
@@ -71,6 +72,7 @@ def test_both_transports_give_the_same_messages_and_times(tmp_path: Path, fault:
     assert ways[True] == ways[False]
 
 
+@pytest.mark.slow
 def test_drivers_may_follow_each_other_and_notice_the_end_of_the_emulator() -> None:
     with EmulatorProcess(hosting=True, period_ms=5) as emulator:
         link = LinkSettings("127.0.0.1", emulator.fri_port, lock_step=True, lock_step_patience_s=5.0)

@@ -27,6 +27,7 @@ def test_every_section_exists():
         assert callable(importlib.import_module(f"benchmarks.trust.{section}").campaign)
 
 
+@pytest.mark.slow
 def test_network_promises_hold():
     ledger = Ledger(None, 5)
     importlib.import_module("benchmarks.trust.network").campaign(ledger, Options())

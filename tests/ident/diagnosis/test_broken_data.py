@@ -121,6 +121,7 @@ def test_no_healthy_arm_is_learnt_from_a_channel_that_cannot_be_what_it_says(
         commission([healthy, edited(pair, "joint", "effort", reversed_sign)], chain)
 
 
+@pytest.mark.slow
 def test_a_dead_sensor_is_left_out_of_the_healthy_arm(pair: list[Session], make: Make, chain: Chain) -> None:
     healthy = [make("c.mcap", 11), make("d.mcap", 12, None, 1)]
     sets = [edited(part, "joint", "effort", dead) for part in (pair, healthy)]

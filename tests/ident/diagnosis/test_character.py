@@ -135,6 +135,7 @@ def sticky(make: Make, day: int, amplitude: float) -> list[Session]:
     return [make("a.mcap", 11 + 10 * day, stick), make("b.mcap", 12 + 10 * day, stick, 1)]
 
 
+@pytest.mark.slow
 def test_friction_that_all_healthy_days_show_is_in_the_reference_and_what_comes_and_goes_is_not(
     make: Make, chain: Chain
 ) -> None:
@@ -143,6 +144,7 @@ def test_friction_that_all_healthy_days_show_is_in_the_reference_and_what_comes_
     assert not commission([sticky(make, 0, 0.12), sticky(make, 1, -0.12)], chain).model.effects
 
 
+@pytest.mark.slow
 def test_a_usual_change_of_what_the_healthy_arm_has_is_in_the_models_and_no_finding(
     make: Make, chain: Chain
 ) -> None:
@@ -165,6 +167,7 @@ def test_a_usual_change_of_what_the_healthy_arm_has_is_in_the_models_and_no_find
     assert [(f.cause, f.joints) for f in findings] == [("stribeck", (2,))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("known_to", "causes"), [(0.02, ["stribeck"]), (0.5, [])])
 def test_a_law_of_the_speed_within_the_error_of_the_healthy_one_is_no_change(
     make: Make, chain: Chain, known_to: float, causes: list[str]

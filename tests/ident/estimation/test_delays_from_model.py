@@ -115,6 +115,7 @@ def sensed(
     return session(sensors=sensors, seed=seed, motion_seed=motion, loaded=loaded, metadata={"uid": f"{seed}"})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("late_s", "motor_s"), [(0.012, 0.0), (0.003, 0.005), (-0.004, -0.002)])
 def test_late_joint_torques_are_found_and_the_motor_torques_against_the_motion(
     late_s: float, motor_s: float

@@ -107,6 +107,7 @@ def test_a_session_without_motor_torques_adds_its_joint_rows():
     assert np.mean(np.abs(errors(found)) < 3) >= 0.95
 
 
+@pytest.mark.slow
 def test_stated_intervals_cover_over_many_sessions():
     settings = IdentificationSettings(model=1, essential=None, signals=SignalSettings(cutoff_hz=6.0))
     inside, textbook = [], []
@@ -234,6 +235,7 @@ def test_a_payload_that_was_announced_but_not_mounted_is_refused(mass):
         identify([bare, claimed], arm.chain(), IdentificationSettings(essential=None))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mass", ["", "3.28"])
 def test_a_payload_that_hung_in_the_session_of_the_bare_arm_is_refused(mass):
     bare, loaded = sessions()

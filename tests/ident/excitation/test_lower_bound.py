@@ -63,6 +63,7 @@ def test_friction_of_one_drive_is_bounded_by_moving_at_full_speed_both_ways(prob
     assert bound.reached == pytest.approx(best, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", OBJECTIVES, ids=lambda one: f"{one.criterion}-{one.scaling}")
 def test_no_motion_is_below_the_bound(
     wrist: PlanProblem, stored: ExcitationPlan, objective: Objective

@@ -123,6 +123,7 @@ def test_the_search_runs_on_a_dask_cluster(brief: PlanProblem) -> None:
     np.testing.assert_array_equal(spread.sample(3.3).q, alone.sample(3.3).q)
 
 
+@pytest.mark.slow
 def test_independent_searches_are_those_of_their_seeds_and_the_best_one_counts(brief: PlanProblem) -> None:
     few = Search(seed=3, starts=1, hops=0)
     alone = [plan(replace(brief, search=replace(few, seed=seed))) for seed in (3, 4)]

@@ -65,6 +65,7 @@ def test_the_extended_model_predicts_the_run_that_was_not_used(train, test, boun
     assert after < before
 
 
+@pytest.mark.slow
 @needs_recordings
 @pytest.mark.parametrize(("train", "test", "bound"), SPLITS)
 def test_cable_of_the_wrist_and_lean_of_the_base_are_named(train, test, bound):
@@ -117,6 +118,7 @@ def imported(mapping: str, source: Path, path: Path) -> Session:
     return read_session(import_log(LogMapping.load(mapping), source, path).path)
 
 
+@pytest.mark.slow
 def test_drives_of_the_tx40_grow_slower_than_speed(tmp_path: Path) -> None:
     """Motor torque alone, nine seconds: sub-linear viscous friction of the two large joints."""
     folder = other("tx40")

@@ -80,6 +80,7 @@ def test_with_the_tilt_the_physical_estimators_deviations_hold_between_any_two_r
         assert np.mean(np.abs(z) < 2.0) >= 0.85
 
 
+@pytest.mark.slow
 def test_the_base_leans_alike_in_every_run():
     tilts = [mounted((run,)) for run in (1, 2, 3)]
     for tilt in tilts:

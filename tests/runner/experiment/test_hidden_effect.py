@@ -51,6 +51,7 @@ def hidden(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     return run("experiment", str(file), "--yes", "--hide", "3", "--out", str(place / "out"))
 
 
+@pytest.mark.slow
 def test_every_seed_draws_an_effect_that_the_emulator_takes(
     planned: tuple[Experiment, Arm, Excitations],
 ) -> None:

@@ -58,6 +58,7 @@ def batch(fleet: Fleet, *options: str):  # type: ignore[no-untyped-def]
     )
 
 
+@pytest.mark.slow
 def test_changes_are_found_on_their_day_and_nobody_else_is_accused(store: FleetStore) -> None:
     arms = {arm.arm: arm for arm in fleet_trend(store).arms}
     assert {name for name, arm in arms.items() if arm.changes} == {"LWR4+_arm_01", "LWR4+_arm_02"}

@@ -96,6 +96,7 @@ def test_the_phase_is_the_last_one_that_began(row: int, phase: str) -> None:
     assert phase_at([[0, "move_to_start"], [10, "period 1"]], row) == phase
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [WIDE[0], NARROW[0]])
 def test_the_page_shows_arm_progress_and_link(ring: Ring, chrome: Browser, width: int) -> None:
     motion = Motion(np.zeros((101, 7)), 0.005, ((0, "move_to_start"), (20, "period 1")))
