@@ -69,7 +69,7 @@ class HealthyNull:
         if usual is None:
             return more
         size, limit = usual
-        if self._is_known(trial, size):
+        if self._is_known(trial, size, here):
             return False
         if here is None:
             return more
@@ -81,13 +81,16 @@ class HealthyNull:
         scatter = self._in_these(candidate, size.scatter, size.shape, here)
         return changed or (more and not size.clear(here, scatter))
 
-    def _is_known(self, trial: Trial, size: UsualSize) -> bool:
-        """Whether a trial is a size that the healthy sets have as well, however little they show of it."""
+    def _is_known(self, trial: Trial, size: UsualSize, usual: Score | None) -> bool:
+        """Whether a trial is a size that the healthy sets have as well, however little they show of it. usual : its
+        score in the usual shape."""
         candidate = trial.candidate
         for shape in dict.fromkeys((self.dictionary.nearest(trial), size.shape)):
             known = size.known.get(shape)
-            here = None if known is None else self.dictionary.scored(candidate, shape)
-            if known is None or here is None or not known.holds(here):
+            if known is None:
+                continue
+            here = usual if shape == size.shape else self.dictionary.scored(candidate, shape)
+            if here is None or not known.holds(here):
                 continue
             other = trial.score.gain - max(here.gain, 0.0)
             if other <= max(_OF_SHAPE * trial.score.gain, self.least(candidate, here)):

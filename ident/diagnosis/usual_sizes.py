@@ -22,7 +22,7 @@ from ident.diagnosis.size import Size
 from ident.effects import find_effect
 from ident.estimators.estimate import fisher_limit
 
-# Least square of a size over its variance for a factor between the two.
+# Least square of a size over its variance, for each of its coefficients, for one other than zero.
 _THERE = 9.0
 # Least number of sets for a limit.
 _LEAST_SETS = 2
@@ -54,7 +54,7 @@ class KnownSize:
         k = len(size.mean)
         covariance = size.covariance + np.eye(k) * size.from_set_to_set**2 / k
         square = float(size.mean @ np.linalg.pinv(covariance) @ size.mean)
-        return cls(size.mean, covariance) if square > _LARGEST**2 * k else None
+        return cls(size.mean, covariance) if square > _THERE * k else None
 
     def stored(self) -> dict[str, Any]:
         """Plain content."""
