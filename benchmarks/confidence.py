@@ -2,13 +2,15 @@
 
     python -m benchmarks.confidence campaign/results.jsonl mujoco_cases
     python -m benchmarks.confidence campaign/results.jsonl mujoco_cases --write
+    python -m benchmarks.confidence --alone campaign/results_without_reference.jsonl mujoco_cases --write
     python -m benchmarks.confidence --check other/results.jsonl --check other_cases --diagram confidence.svg
 
 Reads the findings of campaigns of `benchmarks.discovery` (their `results.jsonl`) and of `benchmarks.mujoco_arms`
-(their folder), for the fit with the names that were doubted. The weights of `ident/diagnosis/confidence.yaml` are those
-of a logistic regression with the signs of `ident.diagnosis.confidence.SIGNS`, each generator with the same weight, and
-a pull to `START` chosen by cross-validation over whole cases. The reliability printed for the fit is that of
-cross-validation too. `--check` judges the confidence as the diagnoses stated it.
+(their folder), for the fit with the names that were doubted. The weights of `ident/diagnosis/confidence.yaml`, or with
+`--alone` of `confidence_alone.yaml`, are those of a logistic regression with the signs of
+`ident.diagnosis.confidence.SIGNS`, each generator with the same weight, and a pull to `START` chosen by
+cross-validation over whole cases. The reliability printed for the fit is that of cross-validation too. `--check` judges
+the confidence as the diagnoses stated it.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from scipy.optimize import minimize
 
 import ident.diagnosis.confidence as stored
 from benchmarks.discovery.tally import read_results
+from benchmarks.mujoco_arms.campaign import diagnosis_of, verdict_of
 from benchmarks.mujoco_arms.judging import habitual, names
 
 Floats = NDArray[np.float64]
@@ -52,14 +55,14 @@ class Said:
     right: bool
 
 
-def read(path: Path, *, doubted: bool = False) -> list[Said]:
+def read(path: Path, *, doubted: bool = False, reference: bool = True) -> list[Said]:
     """All findings of a campaign about what is in the catalogue, but for habits of the healthy arm; of healthy twins,
     too.
 
-    doubted : with the names that were more likely wrong.
+    doubted : with the names that were more likely wrong. reference : whether the arm's healthy days were given.
     """
     said = []
-    for case, hidden, traits, told in _mujoco(path) if path.is_dir() else _own(path):
+    for case, hidden, traits, told in _mujoco(path, reference) if path.is_dir() else _own(path):
         for finding in [*told["findings"], *(told.get("doubted", ()) if doubted else ())]:
             right = any(names(finding, one) for one in hidden)
             if right or not habitual(finding, traits):
@@ -84,13 +87,13 @@ def _own(path: Path) -> list[Content]:
     return found
 
 
-def _mujoco(path: Path) -> list[Content]:
+def _mujoco(path: Path, reference: bool) -> list[Content]:
     found: list[Content] = []
-    for verdict in sorted(path.glob("*/verdict.json")):
+    for verdict in sorted(path.glob(f"*/{verdict_of(path, reference).name}")):
         folder = verdict.parent
         truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
         for place, hidden in ((folder, truth["hidden"]), (folder / "twin", [])):
-            file = place / "diagnosis" / "diagnosis.json"
+            file = diagnosis_of(place, reference) / "diagnosis.json"
             if file.is_file():
                 told = json.loads(file.read_text(encoding="utf-8"))
                 details = file.with_name("details.json")
@@ -165,6 +168,7 @@ def table(sources: Sequence[str], p: Floats, right: Floats) -> str:
 
 @click.command()
 @click.argument("campaigns", nargs=-1, type=click.Path(path_type=Path, exists=True))
+@click.option("--alone", is_flag=True, help="Of diagnoses without a reference, whose weights are apart.")
 @click.option("--write", is_flag=True, help="Store the weights.")
 @click.option(
     "--check",
@@ -173,21 +177,25 @@ def table(sources: Sequence[str], p: Floats, right: Floats) -> str:
     help="Campaign for the reliability of the confidence as it was said.",
 )
 @click.option("--diagram", type=click.Path(path_type=Path), help="Draw the reliability of --check.")
-def main(campaigns: tuple[Path, ...], write: bool, check: tuple[Path, ...], diagram: Path | None) -> None:
+def main(
+    campaigns: tuple[Path, ...], alone: bool, write: bool, check: tuple[Path, ...], diagram: Path | None
+) -> None:
     """Fit the confidence to campaigns, or check it on others."""
     if campaigns:
-        _fit([one for path in campaigns for one in read(path, doubted=True)], write)
+        said = [one for path in campaigns for one in read(path, doubted=True, reference=not alone)]
+        _fit(said, stored.ALONE if alone else stored.WEIGHTS, write)
     if check:
-        said = [one for path in check for one in read(path)]
+        said = [one for path in check for one in read(path, reference=not alone)]
         p, right = (np.array([getattr(one, key) for one in said], float) for key in ("confidence", "right"))
         click.echo(table([one.source for one in said], p, right))
         if diagram is not None:
             _draw([one.source for one in said], p, right, diagram)
 
 
-def _fit(said: Sequence[Said], write: bool) -> None:
-    # Without a healthy arm findings have weights of their own.
-    said = [one for one in said if one.grounds and not one.grounds.get("alone")]
+def _fit(said: Sequence[Said], name: str, write: bool) -> None:
+    said = [one for one in said if one.grounds]
+    if any(bool(one.grounds.get("alone")) != (name == stored.ALONE) for one in said):
+        raise click.ClickException("diagnoses with and without a reference have weights apart; see --alone")
     if not said:
         raise click.ClickException("no finding with grounds in these campaigns; diagnose their cases again")
     points = np.array([stored.scaled(one.grounds) for one in said])
@@ -215,7 +223,7 @@ def _fit(said: Sequence[Said], write: bool) -> None:
     text = yaml.safe_dump(content, sort_keys=False)
     click.echo(text)
     if write:
-        path = Path(stored.__file__).with_name(stored.WEIGHTS)
+        path = Path(stored.__file__).with_name(name)
         path.write_text(f"# Written by `python -m benchmarks.confidence`.\n{text}", encoding="utf-8")
 
 

@@ -31,6 +31,7 @@ from benchmarks.mujoco_arms.tally import table
 @click.option("--cause", type=click.Choice(sorted(ALL)), help="Hide only this.")
 @click.option("--arm", type=click.Choice(["lwr4plus", "ur5"]), help="Only this arm.")
 @click.option("--diagnose", is_flag=True, help="Commission, diagnose and judge.")
+@click.option("--without-reference", is_flag=True, help="Diagnose as if the arm had never been commissioned.")
 @click.option("--again", is_flag=True, help="Commission and diagnose once more what has a verdict.")
 @click.option(
     "--twins", is_flag=True, help="Diagnose the healthy twin of every case, not only where no name is right."
@@ -45,6 +46,7 @@ def main(
     cause: str | None,
     arm: str | None,
     diagnose: bool,
+    without_reference: bool,
     again: bool,
     twins: bool,
     jobs: int,
@@ -53,8 +55,9 @@ def main(
 ) -> None:
     """Make cases, have them diagnosed, and judge what is said."""
     if not report:
-        run(Plan(out, seed, cases, kind, cause, arm, diagnose, again, twins), jobs, click.echo)
-    results = read_results(out)
+        plan = Plan(out, seed, cases, kind, cause, arm, diagnose, again, twins, not without_reference)
+        run(plan, jobs, click.echo)
+    results = read_results(out, not without_reference)
     if results:
         click.echo(table(results))
     elif report:

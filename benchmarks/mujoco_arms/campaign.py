@@ -19,11 +19,13 @@ from benchmarks.mujoco_arms.judging import judge
 from benchmarks.mujoco_arms.tally import rho_of
 
 _LONGEST_S = 3600.0
+# Behind the names of what is written of a diagnosis without healthy days.
+_ALONE = "_without_reference"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What to run, see the command's help."""
+    """What to run, see the command's help. reference : diagnose against the healthy days."""
 
     out: Path
     seed: int
@@ -34,6 +36,7 @@ class Plan:
     diagnose: bool = False
     again: bool = False
     twins: bool = False
+    reference: bool = True
 
     def wanted(self) -> list[tuple[int, str]]:
         """Seed and kind of every case."""
@@ -54,17 +57,28 @@ def run(plan: Plan, jobs: int, say: Callable[[str], Any]) -> None:
         say(line)
 
 
-def read_results(out: Path) -> list[dict[str, Any]]:
+def verdict_of(folder: Path, reference: bool = True) -> Path:
+    """Where the verdict on a case is stored."""
+    return folder / f"verdict{'' if reference else _ALONE}.json"
+
+
+def diagnosis_of(folder: Path, reference: bool = True) -> Path:
+    """Folder of the diagnosis of a case, or of its twin in `twin`."""
+    return folder / f"diagnosis{'' if reference else _ALONE}"
+
+
+def read_results(out: Path, reference: bool = True) -> list[dict[str, Any]]:
     """Verdicts on all diagnoses in a folder, or their crashes, in order of the cases' names."""
-    return [read_result(path.parent) for path in sorted(out.glob("*/verdict.json"))]
+    found = sorted(out.glob(f"*/{verdict_of(out, reference).name}"))
+    return [read_result(path.parent, reference) for path in found]
 
 
-def read_result(folder: Path) -> dict[str, Any]:
+def read_result(folder: Path, reference: bool = True) -> dict[str, Any]:
     """The verdict on the diagnosis of a case, judged anew."""
-    result = {**_json(folder / "verdict.json"), "truth": _json(folder / "truth.json")}
+    result = {**_json(verdict_of(folder, reference)), "truth": _json(folder / "truth.json")}
     if "crash" not in result:
-        twin = folder / "twin" / "diagnosis" / "diagnosis.json"
-        told = _json(folder / "diagnosis" / "diagnosis.json")
+        twin = diagnosis_of(folder / "twin", reference) / "diagnosis.json"
+        told = _json(diagnosis_of(folder, reference) / "diagnosis.json")
         result["verdict"] = judge(told, result["truth"], _json(twin) if twin.is_file() else None)
     return result
 
@@ -82,37 +96,32 @@ def _one(plan: Plan, seed: int, kind: str) -> str:
     line = f"{case.name:<14} rho {rho_of({'truth': truth}):5.2f}  {hidden or 'nothing':<40}"
     if not plan.diagnose:
         return f"{line} {time.monotonic() - began:.0f} s"
-    verdict = folder / "verdict.json"
+    verdict = verdict_of(folder, plan.reference)
     if not verdict.is_file() or plan.again:
         result: dict[str, Any] = {}
         try:
-            result["seconds"] = diagnosed(folder, plan.again)
+            result["seconds"] = diagnosed(folder, plan.again, reference=plan.reference)
             if truth["hidden"] and (kind == "outside" or plan.twins):
-                diagnosed(folder / "twin", plan.again, folder)
+                diagnosed(folder / "twin", plan.again, folder, plan.reference)
         except (RuntimeError, subprocess.TimeoutExpired) as error:
             result["crash"] = str(error)
         verdict.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    result = read_result(folder)
+    result = read_result(folder, plan.reference)
     if "crash" in result:
         return f"{line} CRASH {result['crash'].splitlines()[-1]}"
     return f"{line} {'; '.join(result['verdict']['findings']) or 'silent'}"
 
 
-def diagnosed(folder: Path, again: bool, home: Path | None = None) -> float:
-    """Write `diagnosis` in a folder; returns its processor time [s].
+def diagnosed(folder: Path, again: bool, home: Path | None = None, reference: bool = True) -> float:
+    """Write the diagnosis of a folder's sessions; returns its processor time [s].
 
-    home : folder of the reference days, where it is another. RuntimeError with the last lines of a command that fails.
+    home : folder of the reference days, where it is another. reference : False leaves those days out.
+    RuntimeError with the last lines of a command that fails.
     """
     home = home or folder
-    reference, out = home / "reference.yaml", folder / "diagnosis"
     ratios = _json(home / "truth.json")["gear_ratio"]
     gear = ["--gear-ratio", ",".join(f"{ratio:g}" for ratio in ratios)]
-    if not reference.is_file() or (again and home == folder):
-        reference.unlink(missing_ok=True)
-        days = sorted(home.glob("reference_day_*"))
-        logs = [str(path) for day in days for path in sorted(day.glob("*.mcap"))]
-        command = ["commission", *logs, "--sets", str(len(days)), *gear, "--out", str(reference)]
-        _command(command, home / "commission.txt")
+    healthy = ["--reference", str(_commissioned(home, gear, again and home == folder))] if reference else []
     train = [str(path) for path in sorted(folder.glob("train_*.mcap"))]
     test = [item for path in sorted(folder.glob("test_*.mcap")) for item in ("--test", str(path))]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -120,17 +129,29 @@ def diagnosed(folder: Path, again: bool, home: Path | None = None) -> float:
         "diagnose",
         *train,
         *test,
-        "--reference",
-        str(reference),
+        *healthy,
         *gear,
         "--no-simulation",
         "--out",
-        str(out),
+        str(diagnosis_of(folder, reference)),
         "--force",
     ]
     _command(command, folder / "diagnose.txt")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def _commissioned(home: Path, gear: Sequence[str], again: bool) -> Path:
+    """The reference of the healthy days, made if it lacks."""
+    path = home / "reference.yaml"
+    if again:
+        path.unlink(missing_ok=True)
+    if not path.is_file():
+        days = sorted(home.glob("reference_day_*"))
+        logs = [str(log) for day in days for log in sorted(day.glob("*.mcap"))]
+        command = ["commission", *logs, "--sets", str(len(days)), *gear, "--out", str(path)]
+        _command(command, home / "commission.txt")
+    return path
 
 
 def _command(arguments: Sequence[str], log: Path) -> None:

@@ -157,7 +157,7 @@ def commission(
         one,
         *(_tuned(one.arm, recordings, settings, 1, late) for recordings in recorded[1:_TUNING_SETS]),
     ]
-    known = as_stated(
+    known = with_compliance_std(
         _middle([tuned.arm for tuned in several]),
         [tuned.arm.compliance for tuned in several],
         [tuned.compliance_std for tuned in several if tuned.compliance_std is not None],
@@ -304,7 +304,7 @@ def _middle(arms: Sequence[NominalArm]) -> NominalArm:
     )
 
 
-def as_stated(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = ()) -> NominalArm:
+def with_compliance_std(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = ()) -> NominalArm:
     """The arm with the standard error of its compliance from those of the sets (n,) [rad/Nm] and by each one's rows,
     and with the stated one, known to a factor, where encoders at the motors do not tell it: the sets do not agree on
     one, or end at that factor. Behind encoders at the links a stated one that no set shows is unknown. Without a stated

@@ -11,7 +11,7 @@ import pytest
 from ident.diagnosis import bench, channel_delays, recording
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.channel_delays import common_delays
-from ident.diagnosis.commission import Side, _encoder, as_stated
+from ident.diagnosis.commission import Side, _encoder, with_compliance_std
 from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std
 from ident.diagnosis.diagnose import late_by_themselves
 from ident.diagnosis.healthy_null import HealthyNull
@@ -161,24 +161,24 @@ def test_a_stiffness_that_the_sets_do_not_tell_is_the_stated_one(arm: NominalArm
     # Agreed on, differing from set to set, and at the end of the factor within which it is stated.
     sets = [np.array([0.80e-4, 0.6e-4, 0.5e-4]), np.array([0.82e-4, 1.4e-4, 0.5e-4])]
     behind = replace(arm, compliance=np.mean(sets, axis=0), encoder="motor", stated=stated)
-    found = as_stated(behind, sets)
+    found = with_compliance_std(behind, sets)
     np.testing.assert_allclose(found.compliance, [0.81e-4, 1e-4, 1e-4])
     assert found.compliance_std is not None
     np.testing.assert_allclose(found.compliance_std, [0.01e-4, 0.5e-4, 0.5e-4])
-    single = as_stated(replace(behind, compliance=sets[0]), sets[:1])
+    single = with_compliance_std(replace(behind, compliance=sets[0]), sets[:1])
     np.testing.assert_allclose(single.compliance, [0.8e-4, 0.6e-4, 1e-4])
-    before = as_stated(replace(behind, encoder="link"), sets)
+    before = with_compliance_std(replace(behind, encoder="link"), sets)
     np.testing.assert_array_equal(before.compliance, behind.compliance)
     # A fit that ends at a rigid joint in each set knows no stiffness of a joint that is stated elastic.
     rigid = [np.array([0.8e-4, 0.0, 0.0])] * 2
     ended = replace(
         behind, encoder="link", compliance=rigid[0], stated=stated * (1.0, 1.0, 0.0), compliance_std=None
     )
-    np.testing.assert_allclose(as_stated(ended, rigid).compliance_std, [0.0, 0.5e-4, 0.0])
+    np.testing.assert_allclose(with_compliance_std(ended, rigid).compliance_std, [0.0, 0.5e-4, 0.0])
     # So does one that ends at the softest joint.
     soft = [np.array([0.8e-4, 3e-4, 0.0])] * 2
     np.testing.assert_allclose(
-        as_stated(replace(ended, compliance=soft[0]), soft).compliance_std, [0.0, 0.5e-4, 0.0]
+        with_compliance_std(replace(ended, compliance=soft[0]), soft).compliance_std, [0.0, 0.5e-4, 0.0]
     )
 
 
@@ -212,7 +212,7 @@ def test_joints_of_an_undescribed_arm_twist_where_the_sets_clearly_tell_it(arm: 
         sets = [np.array([0.8e-4, 0.5e-4, softest])] * 2
         own = [np.array([0.05e-4, 0.6e-4, 0.01e-4])] * 2
         undescribed = replace(arm, encoder=encoder, compliance=sets[0], stated=usual, within=8.0)
-        found = as_stated(undescribed, sets, own)
+        found = with_compliance_std(undescribed, sets, own)
         np.testing.assert_array_equal(found.compliance, [0.8e-4, 0.0, 0.0])
         assert found.compliance_std is not None
         np.testing.assert_allclose(found.compliance_std, [0.05e-4 / np.sqrt(2.0), 0.0, 0.0])
@@ -231,7 +231,7 @@ def test_encoders_of_an_undescribed_arm_are_at_the_links_unless_the_motors_are_c
 @pytest.mark.parametrize("encoder", ["link", "motor"])
 def test_a_joint_that_hardly_moves_is_known_as_stated(arm: NominalArm, encoder: Side) -> None:
     stated, own = np.full(3, 1e-4), [np.array([1e-6, np.inf, np.inf])] * 2
-    found = as_stated(replace(arm, encoder=encoder, compliance=stated, stated=stated), [stated] * 2, own)
+    found = with_compliance_std(replace(arm, encoder=encoder, compliance=stated, stated=stated), [stated] * 2, own)
     np.testing.assert_allclose(found.compliance_std, [1e-6 / np.sqrt(2.0), 0.5e-4, 0.5e-4])
 
 
