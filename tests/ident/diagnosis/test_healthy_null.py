@@ -231,7 +231,9 @@ def test_encoders_of_an_undescribed_arm_are_at_the_links_unless_the_motors_are_c
 @pytest.mark.parametrize("encoder", ["link", "motor"])
 def test_a_joint_that_hardly_moves_is_known_as_stated(arm: NominalArm, encoder: Side) -> None:
     stated, own = np.full(3, 1e-4), [np.array([1e-6, np.inf, np.inf])] * 2
-    found = with_compliance_std(replace(arm, encoder=encoder, compliance=stated, stated=stated), [stated] * 2, own)
+    found = with_compliance_std(
+        replace(arm, encoder=encoder, compliance=stated, stated=stated), [stated] * 2, own
+    )
     np.testing.assert_allclose(found.compliance_std, [1e-6 / np.sqrt(2.0), 0.5e-4, 0.5e-4])
 
 
