@@ -249,7 +249,7 @@ BUGS: tuple[Bug, ...] = (
     ),
     Bug(
         "a late channel is dropped for slow rows with the reversals in them",
-        "ident/diagnosis/diagnose.py",
+        "ident/diagnosis/late_channels.py",
         "    if told is not None:\n        return told\n    bench.evidence.replace([])\n",
         "    bench.evidence.replace([])\n",
         (

@@ -238,7 +238,7 @@ def test_a_delay_that_slow_rows_contradict_is_known_no_better_than_their_differe
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (plain,) = diagnosed(late_motor).claims
-    module = importlib.import_module("ident.diagnosis.diagnose")
+    module = importlib.import_module("ident.diagnosis.late_channels")
     monkeypatch.setattr(module, "slow_delay", lambda *_: (0.0075, 1e-4))
     (late,) = diagnose(pair(make, late_motor), chain).claims
     assert plain.parameters["delay"].std < 5e-4

@@ -13,8 +13,8 @@ from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.channel_delays import common_delays
 from ident.diagnosis.commission import Side, _encoder, with_compliance_std
 from ident.diagnosis.day_spread import compliance_std, delay_std, gain_std
-from ident.diagnosis.diagnose import late_by_themselves
 from ident.diagnosis.healthy_null import HealthyNull
+from ident.diagnosis.late_channels import late_by_themselves
 from ident.diagnosis.nominal_arm import GAIN_STD, NominalArm
 from ident.diagnosis.presliding import with_far_presliding
 from ident.diagnosis.reference import DELAY_STD_S, Reference
@@ -409,12 +409,12 @@ def test_a_session_that_hardly_tells_a_delay_does_not_contradict_one_that_does(
 
 def test_a_channel_late_away_from_reversals_alone_is_a_note() -> None:
     apart = {"motor": (4.8e-3, 7e-4), "joint": (-2e-3, 3e-4)}
-    state = SimpleNamespace(timing=(), notes=())
+    state = SimpleNamespace(timing=(), corrected=())
     late, early = late_by_themselves(apart, state)  # type: ignore[arg-type]
     assert late.startswith("motor torques look 4.8 ± 0.7 ms late against the healthy arm")
     assert early.startswith("joint torques look 2.0 ± 0.3 ms early")
     # A finding of the channel, or a note of it, has said so.
-    state.timing, state.notes = (SimpleNamespace(cause="motor_torque_delay"),), ("joint torques look late",)
+    state.timing, state.corrected = (SimpleNamespace(cause="motor_torque_delay"),), ("joint",)
     assert late_by_themselves(apart, state) == []  # type: ignore[arg-type]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ident.diagnosis.candidates import Candidate
-from ident.diagnosis.diagnose import _rest
+from ident.diagnosis.late_channels import _rest
 from ident.diagnosis.signatures import signature_bench
 from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, Shape
