@@ -180,7 +180,8 @@ def record(
     """Filter one session. recall : as for `prepare`. Raises DataError for sessions without a stretch long enough."""
     chosen = session.select(chain.joint_names)
     rate = 1.0 / chosen.joint.period_s
-    prepared = prepare(chosen, settings.signals.punctual, recall=recall)
+    # A diagnosis chooses the settings of its signals itself.
+    prepared = prepare(chosen, settings.signals.punctual, advise=False, recall=recall)
     motor = chosen.motor
     stuck = () if motor is None else stuck_at(motor, chosen.joint)
     stretches = tuple(_stretches(prepared, rate, stuck))

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ident.diagnosis.broken_data import BrokenChannel
-from ident.diagnosis.claims_in_words import finding_statement
+from ident.diagnosis.claims_in_words import SURE, finding_statement
+from ident.diagnosis.details import moved_parameters, row_gains, session_errors
 from ident.diagnosis.products import Floats
 from ident.diagnosis.statements import Statements, statements
 from ident.diagnosis.torque_errors import TorqueErrors
@@ -194,7 +196,7 @@ class Diagnosis(Tabular):
     rms_base, rms_extended : rms error (n,) [Nm] by side in the held-out rows, beside the noise_floor of these rows.
     healthy_left : the same of the base model on the healthy arm of the reference, empty if unknown.
     torque_base, torque_extended : errors of the models in the test sessions with all samples, None without any.
-    notes : sentences on limits of the data. data : broken channels, left out.
+    referenced : against a healthy arm. notes : sentences on limits of the data. data : broken channels, left out.
     residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN in unused rows.
     states : of the arm in these rows, by side.
     """
@@ -221,6 +223,7 @@ class Diagnosis(Tabular):
     extension: tuple[str, ...] = ()
     residuals: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict, repr=False)
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
+    referenced: bool = False
     data: tuple[BrokenChannel, ...] = ()
     healthy: tuple[Mapping[str, Any], ...] = ()
     healthy_left: Mapping[str, Floats] = field(default_factory=dict)
@@ -329,10 +332,23 @@ class Diagnosis(Tabular):
             "model": "model_extended.yaml",
         }
 
+    @cached_property
+    def details(self) -> dict[str, Any]:
+        """Content of `details.json` about the verdict: errors of each joint, parameters moved, limits of the data."""
+        return {
+            "joints": list(self.base_model.structure.chain.joint_names),
+            "reference": self.referenced,
+            "sure": SURE,
+            "rows": row_gains(self),
+            "base_parameters": moved_parameters(self),
+            "notes": list(self.notes),
+            "doubted": [finding.to_dict() for finding in self.doubted],
+            "torque_errors": session_errors(self),
+        }
+
     def statements(self) -> Statements:
         """The diagnosis in words."""
-        names = self.base_model.structure.chain.joint_names
-        return statements(self.to_dict(), {"notes": self.notes}, names)
+        return statements(self.to_dict(), self.details, self.details["joints"])
 
     def __str__(self) -> str:
         return self.statements().text()

@@ -1,8 +1,7 @@
-"""Records of a diagnosis for tables and plots: gains on held-out data, residuals, replay errors, look-alikes."""
+"""Records of a diagnosis for plots: residuals, replay errors, look-alikes."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.diagnosis import Diagnosis
-from ident.diagnosis.held_out import HeldOut, interval
 from ident.diagnosis.look_alikes import LookAlikes, Trace
 from ident.diagnosis.result import RowStates
 from runner.replay import Replayed
@@ -24,65 +22,9 @@ Floats = NDArray[np.float64]
 RESIDUALS, REPLAY, LOOK_ALIKES = "residuals.npz", "replay.npz", "look_alikes.npz"
 QUANTITIES = ("position", "motor", "joint")
 
-_SEED = 1
 _MODELS = ("base", "extended")
 _ROWS = ("time", "session", "block", "position", "speed", "load", "base", "extended")
 _TRACE = ("time", "session", "position", "velocity", "load", "motor_angle", "first", "second", "measured")
-
-
-def row_gains(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Held-out torque error of each joint (from 1) and side [Nm], as plain content of details.json.
-
-    noise_floor : of the error of any model. healthy : the same error on the healthy arm of the reference, None if
-    unknown. gain : base minus extended, with its 95 % interval from blocks drawn with replacement. avoidable : the part
-    of the base model's error above the noise, its share as a share of power.
-    """
-    found = []
-    for side, base in diagnosis.residuals.get("base", {}).items():
-        block = {side: diagnosis.states[side].block}
-        before = HeldOut({side: base}, block)
-        after = HeldOut({side: diagnosis.residuals["extended"][side]}, block)
-        if after.residual[side].shape != base.shape:
-            continue
-        for joint in np.flatnonzero(np.isfinite(base).any(axis=0)).tolist():
-            rms_base, rms_extended, low, high = interval(before, after, [(side, joint)], _SEED)
-            noise = float(diagnosis.noise_floor[side][joint])
-            healthy = diagnosis.healthy_left.get(side, np.full(base.shape[1], np.nan))[joint]
-            avoidable = math.sqrt(max(0.0, rms_base**2 - noise**2))
-            found.append(
-                {
-                    "side": side,
-                    "joint": joint + 1,
-                    "noise_floor": noise,
-                    "healthy": float(healthy) if np.isfinite(healthy) else None,
-                    "test_rms_base": rms_base,
-                    "test_rms_extended": rms_extended,
-                    "gain": rms_base - rms_extended,
-                    "gain_interval_95": [low, high],
-                    "avoidable": avoidable,
-                    "avoidable_share": avoidable**2 / rms_base**2 if rms_base > 0.0 else 0.0,
-                }
-            )
-    return found
-
-
-def moved_parameters(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Base parameters moved by the extension by more than two standard deviations, the furthest first: plain content.
-
-    They had absorbed the findings. change_in_std : in standard deviations of the extended estimate.
-    """
-    base, extended = diagnosis.base_model, diagnosis.extended_model
-    std = extended.std
-    if std is None or not diagnosis.extension:
-        return []
-    units = dict(zip(extended.names, extended.units, strict=True))
-    spread = dict(zip(extended.names, map(float, std), strict=True))
-    found: list[dict[str, Any]] = []
-    for name in diagnosis.changes:
-        before, after, deviation = base.value(name), extended.value(name), spread[name]
-        entry = {"name": name, "unit": units[name], "base": before, "extended": after, "std": deviation}
-        found.append({**entry, "change_in_std": (after - before) / deviation if deviation > 0.0 else 0.0})
-    return sorted(found, key=lambda entry: -abs(entry["change_in_std"]))
 
 
 @dataclass(frozen=True, eq=False)

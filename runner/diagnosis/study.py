@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,6 @@ from ident.diagnosis.statements import Statements, statements
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.session_chain import session_chain
 from ident.effects import find_effect
-from ident.estimation.scores import finite
 from ident.model import DynamicModel
 from ident.model.model_file import write_model
 from lwr_driver.arm import Arm
@@ -33,8 +30,6 @@ from runner.diagnosis.records import (
     RESIDUALS,
     ReplayErrors,
     Residuals,
-    moved_parameters,
-    row_gains,
     write_look_alikes,
 )
 from runner.estimation import couplings
@@ -59,27 +54,22 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A diagnosis with its gains, limits, look-alikes and discriminating experiments.
+    """A diagnosis with its limits, look-alikes and discriminating experiments.
 
-    sessions : names in their order. referenced : whether a healthy reference was at hand. pairs : look-alikes, side
-    by side. replayed : errors of the simulation over time. offers : discriminating experiments. material : the
-    inputs. sure : confidence below which a finding with alternatives is open. torque_errors : of the base and the
-    extended model in each held-out session, the figure of `validate`.
+    notes : limits of the data and of the replay. sessions : names in their order. pairs : look-alikes, side by side.
+    replayed : errors of the simulation over time. offers : discriminating experiments. material : the inputs.
+    sure : confidence below which a finding with alternatives is open.
     """
 
     diagnosis: Diagnosis
-    gains: Sequence[Mapping[str, Any]]
-    moved: Sequence[Mapping[str, Any]]
     notes: tuple[str, ...]
     residuals: Residuals
     sessions: tuple[str, ...]
-    referenced: bool
     pairs: tuple[LookAlikes, ...] = ()
     replayed: ReplayErrors | None = None
     offers: tuple[Discriminating, ...] = field(default=())
     material: Material | None = field(default=None, repr=False)
     sure: float = SURE
-    torque_errors: tuple[Mapping[str, Any], ...] = ()
 
     @property
     def said(self) -> Statements:
@@ -103,14 +93,9 @@ class Study:
         return {
             "schema_version": 1,
             "sessions": list(self.sessions),
-            "joints": list(self.residuals.joint_names),
-            "reference": self.referenced,
+            **self.diagnosis.details,
             "sure": self.sure,
-            "rows": list(self.gains),
-            "base_parameters": list(self.moved),
             "notes": list(self.notes),
-            "doubted": [finding.to_dict() for finding in self.diagnosis.doubted],
-            "torque_errors": list(self.torque_errors),
             "look_alikes": [pair.to_dict() for pair in self.pairs],
             "deciding_motions": [offer.to_dict() for offer in self.offers],
         }
@@ -172,18 +157,17 @@ def study(
         encoder = "link" if healthy is None else healthy.encoder
         replay = Replay(_stiffness(arm, healthy), everything, encoder=encoder)
     logs, held_out = list(sessions), list(test)
-    with _unadvised():
-        found = diagnose(
-            logs,
-            chain,
-            test=held_out,
-            arm=data,
-            model=model,
-            reference=healthy,
-            settings=DiagnosisSettings(jobs=jobs),
-            simulate=replay,
-        )
-        pairs, unshown = look_alikes(found, sessions, chain, compare, arm=data, reference=healthy)
+    found = diagnose(
+        logs,
+        chain,
+        test=held_out,
+        arm=data,
+        model=model,
+        reference=healthy,
+        settings=DiagnosisSettings(jobs=jobs),
+        simulate=replay,
+    )
+    pairs, unshown = look_alikes(found, sessions, chain, compare, arm=data, reference=healthy)
     notes = list(found.notes)
     if replay is not None:
         notes += replay.notes
@@ -191,33 +175,13 @@ def study(
     names = tuple(session.path.name for session in everything)
     return Study(
         found,
-        row_gains(found),
-        moved_parameters(found),
         tuple(notes),
         Residuals.of(found, names, data.gear_ratio),
         names,
-        healthy is not None,
         pairs,
         _first_replay(replay),
         material=Material(tuple(sessions), chain, data, healthy),
         sure=sure,
-        torque_errors=_torque_errors(found),
-    )
-
-
-def _torque_errors(found: Diagnosis) -> tuple[Mapping[str, Any], ...]:
-    if found.torque_base is None or found.torque_extended is None:
-        return ()
-    return tuple(
-        {
-            "session": one.session,
-            "by_side": {
-                side: {"base": finite(error), "extended": finite(other.relative.get(side))}
-                for side, error in one.relative.items()
-            },
-        }
-        for one, other in zip(found.torque_base.scores, found.torque_extended.scores, strict=True)
-        if all(map(np.isfinite, (*one.relative.values(), *other.relative.values())))
     )
 
 
@@ -226,21 +190,6 @@ def _first_replay(replay: Replay | None) -> ReplayErrors | None:
         return None
     name = replay.first[0][0]
     return ReplayErrors.of(name, [done for session, done in replay.first if session == name])
-
-
-@contextmanager
-def _unadvised() -> Iterator[None]:
-    """Without advice on settings of the signals; a diagnosis chooses them itself."""
-
-    def wanted(record: logging.LogRecord) -> bool:
-        return "raise `" not in record.getMessage()
-
-    logger = logging.getLogger("ident.rows.prepare")
-    logger.addFilter(wanted)
-    try:
-        yield
-    finally:
-        logger.removeFilter(wanted)
 
 
 def _stiffness(arm: Arm | None, healthy: Reference | None) -> NDArray[np.float64] | None:

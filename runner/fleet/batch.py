@@ -253,13 +253,15 @@ def _diagnoses(store: ArmStore, order: Order, usual: Mapping[str, float]) -> lis
 
 
 def _reference(store: ArmStore, sets: Sequence[Sequence[Path]]) -> Reference:
-    if not store.reference.is_file():
+    found = Reference.of(read_model(store.reference)) if store.reference.is_file() else None
+    # Some stores have a model in its place, which tells nothing of healthy days.
+    if found is None or not found.sets:
         read = [[read_session(path, status=False) for path in one] for one in sets]
         chain = session_chain(read[0][0])
         data = arm_data(known_arm(None, chain), chain)
         found = commission(read, chain, arm=data, robot=store.name)
-        write_model(found.model, store.reference)
-    return Reference.of(read_model(store.reference))
+        found.save(store.reference)
+    return found
 
 
 def _diagnosed(store: ArmStore, key: str, files: Sequence[Path], reference: Reference) -> Progress:
