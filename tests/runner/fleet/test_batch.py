@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 from playwright.sync_api import Browser
 
+from ident.diagnosis import Reference
 from ident.estimation.identify import IdentificationSettings
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import read_model
@@ -162,3 +163,23 @@ def test_the_pages_of_a_trend_are_accessible_and_fit(
             with opened(chrome, page, size) as seen:
                 assert seen.page.evaluate(CONTRAST) >= 4.5
                 assert flaws(seen) == []
+
+
+@pytest.mark.slow
+def test_days_are_diagnosed_against_the_healthy_days_before(
+    truth_model: DynamicModel,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    fleet = Fleet(truth_model, tmp_path / "logs", (Event(0, "wear", 3, joint=2, size=0.5),))
+    for day in range(4):
+        fleet.record(0, day)
+    folder = tmp_path / "store"
+    options = ["--store", str(folder), "--diagnose", "all"]
+    assert CliRunner().invoke(main, ["batch", str(fleet.folder), *options]).exit_code == 0
+    (store,) = FleetStore(folder).arms()
+    reference = Reference.of(read_model(store.reference))
+    assert reference.sets == 3
+    assert reference.null
+    assert reference.noise
+    (found,) = store.read("findings")
+    assert (found["cause"], found["joints"]) == ("wear", "2")
