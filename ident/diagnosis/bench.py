@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fri.errors import DataError
 from ident.diagnosis.candidates import Dictionary, Trial
 from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.noise import misfit, noise_floor, repeatability
-from ident.diagnosis.nominal import TRAVEL_RAD, Nominal, structure_of
+from ident.diagnosis.nominal import Nominal, structure_of
 from ident.diagnosis.nominal_arm import STATED_WITHIN, NominalArm
 from ident.diagnosis.products import Floats
 from ident.diagnosis.recording import SessionRecord
@@ -88,26 +87,6 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             healthy=tuple(e for e in reference.model.effects if e["cause"] != PRESLIDING.cause),
         )
     return NominalArm(chain, compliance, ratio, couplings=data.couplings, stated=compliance)
-
-
-def some_joint_moves(recordings: Sequence[SessionRecord]) -> None:
-    """Raises DataError if no joint moves in the fitted sessions."""
-    fitted = [s for r in recordings if not r.test for s in r.stretches]
-    if not any(np.any(np.ptp(s.q, axis=0) > TRAVEL_RAD) for s in fitted):
-        raise DataError(
-            f"no joint moves by more than {TRAVEL_RAD} rad; a static pose excites no dynamics. Record an "
-            "excitation"
-        )
-
-
-def every_joint_moves(recordings: Sequence[SessionRecord], chain: Chain) -> None:
-    """Raises DataError for a joint without motion."""
-    for joint, name in enumerate(chain.joint_names):
-        if not any(np.ptp(s.q[:, joint]) > 0.01 for r in recordings for s in r.stretches):
-            raise DataError(
-                f"joint {name} never moves by more than 0.01 rad; a diagnosis needs motion of every joint. "
-                "Record an excitation, or use a chain in which the joint is fixed"
-            )
 
 
 def prepare_bench(

@@ -15,7 +15,6 @@ from ident.diagnosis.bench import (
     UNSURE,
     ArmData,
     DiagnosisBench,
-    every_joint_moves,
     mean_delay,
     nominal_arm,
     prepare_bench,
@@ -30,7 +29,7 @@ from ident.diagnosis.nominal_arm import STATED_WITHIN, NominalArm
 from ident.diagnosis.presliding import SlowTurns, presliding_length, slow_turns, with_far_presliding
 from ident.diagnosis.probes import remainder_gains
 from ident.diagnosis.products import Floats, Rows
-from ident.diagnosis.recording import SessionRecord, record, settled_for_all
+from ident.diagnosis.recording import SessionRecord, every_joint_moves, record, settled_for_all
 from ident.diagnosis.reference import (
     Reference,
     shared,

@@ -14,12 +14,10 @@ from ident.diagnosis.bench import (
     DiagnosisBench,
     again_with,
     nominal_arm,
-    some_joint_moves,
 )
 from ident.diagnosis.broken_data import (
     BrokenChannel,
     blamed,
-    broken_channels,
     is_broken,
     without_broken,
     worthless,
@@ -28,7 +26,7 @@ from ident.diagnosis.channel_delays import sides_apart
 from ident.diagnosis.conclusion import conclude
 from ident.diagnosis.late_channels import in_time, late_by_themselves, without_late
 from ident.diagnosis.payloads import other_masses, payload_finding, unstated_body, with_masses
-from ident.diagnosis.recording import record, settled
+from ident.diagnosis.preparation import preparation
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.result import Diagnosis
 from ident.diagnosis.selection import Selection, best_candidate, longer_turns
@@ -37,8 +35,6 @@ from ident.diagnosis.task import Simulate, State, Task
 from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, PRESLIDING
 from ident.model import Model, as_model
-from ident.model.signals import signal_settings
-from ident.rows.content import Recall
 from ident.rows.sessions import require
 from lwr_driver.session import Sessions, as_sessions
 
@@ -75,24 +71,11 @@ def diagnose(
         reference = Reference.of(as_model(reference, "reference"))
     if not sessions:
         raise DataError("no session given; name at least one session file")
-    everything = sorted([*sessions, *test], key=lambda s: s.start)
-    held = {id(s) for s in test}
-    couplings, recall = () if arm is None else arm.couplings, Recall()
-    # As `identify` does, whatever a reference filters with.
-    broken = broken_channels(everything, chain, settings.signals, couplings, recall=recall)
-    known = None if reference is None else signal_settings(reference.model)
-    if known is not None:
-        # Of the reference's sessions, not of these.
-        known = replace(known, motor_delay_s="estimate", joint_delay_s="estimate")
-        settings = replace(settings, signals=known)
+    couplings = () if arm is None else arm.couplings
+    ready = preparation(sessions, test, chain, settings, couplings, reference)
+    settings, broken = ready.settings, ready.broken
     with blamed(broken, chain.joint_names):
-        settings = settled(settings, sessions, chain, couplings, recall=recall)
-        recordings = tuple(
-            record(s, k, chain, settings, test=id(s) in held, recall=recall) for k, s in enumerate(everything)
-        )
-        del recall
-        some_joint_moves(recordings)
-        recordings = without_broken(recordings, broken)
+        recordings = without_broken(ready.recordings, broken)
         nominal = nominal_arm(chain, arm, reference)
         task = Task(
             sessions, test, nominal, recordings, settings, reference, causes, model, simulate, not broken

@@ -187,7 +187,9 @@ def look_alikes(
     wanted += [(0, *pair) for pair in asked_for]
     if not wanted:
         return (), ()
-    bench = signature_bench(sessions, chain, arm=arm, reference=reference, settings=settings)
+    bench = signature_bench(
+        sessions, chain, arm=arm, reference=reference, settings=settings, broken=diagnosis.data
+    )
     nuisance = list(bench.evidence.extra)
     columns = {(f.cause, f.joints): _columns(bench, f) for f in diagnosis.claims}
     found, notes = [], []

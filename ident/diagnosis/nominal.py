@@ -24,7 +24,7 @@ from scipy.sparse import csr_array
 from ident.diagnosis.broken_data import unseen
 from ident.diagnosis.nominal_arm import NominalArm
 from ident.diagnosis.parts import Piece, gather
-from ident.diagnosis.recording import RecordStretch, SessionRecord, usual_step
+from ident.diagnosis.recording import TRAVEL_RAD, RecordStretch, SessionRecord, usual_step
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet, numeric_base
@@ -56,8 +56,6 @@ _RIGID = 1e-6
 _RELAXATION_S = 2e-3
 # Least eigenvalue of a mass matrix over its largest.
 _LEAST_MASS = 1e-3
-# A joint within this range carries no information on its friction, gears and cables.
-TRAVEL_RAD = 0.1
 
 
 def structure_of(arm: NominalArm, recordings: Sequence[SessionRecord]) -> tuple[ModelStructure, BaseSet]:

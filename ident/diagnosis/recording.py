@@ -27,6 +27,9 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
+TRAVEL_RAD = 0.1
+"""A joint within this range carries no information on its friction, gears and cables."""
+
 # Least period of motor samples over that of positions, for a clock of their own.
 _OWN_CLOCK = 1.5
 # Largest relative difference of one sensor's limit between sessions.
@@ -107,6 +110,30 @@ class SessionRecord:
         """Sides with recorded torque."""
         motor: tuple[Side, ...] = ("motor",) if self.has_motor else ()
         return (*motor, "joint") if self.has_effort else motor
+
+
+def some_joint_moves(recordings: Sequence[SessionRecord]) -> None:
+    """Raises DataError if no joint moves in the fitted sessions."""
+    if not _moving([one for one in recordings if not one.test]).any():
+        raise DataError(
+            f"no joint moves by more than {TRAVEL_RAD} rad; a static pose excites no dynamics. Record an "
+            "excitation"
+        )
+
+
+def every_joint_moves(recordings: Sequence[SessionRecord], chain: Chain) -> None:
+    """Raises DataError for joints without motion."""
+    still = [name for name, moves in zip(chain.joint_names, _moving(recordings), strict=True) if not moves]
+    if still:
+        raise DataError(
+            f"no motion of more than {TRAVEL_RAD} rad: {', '.join(still)}; a baseline needs motion of every joint. "
+            "Record an excitation, or use a chain in which such a joint is fixed"
+        )
+
+
+def _moving(recordings: Sequence[SessionRecord]) -> NDArray[np.bool_]:
+    """Joints (n,) that move within a stretch."""
+    return np.any([np.ptp(s.q, axis=0) > TRAVEL_RAD for one in recordings for s in one.stretches], axis=0)
 
 
 def settled(

@@ -16,9 +16,10 @@ import numpy as np
 
 from fri.errors import DataError
 from ident.diagnosis.bench import ArmData, DiagnosisBench, nominal_arm, prepare_bench
+from ident.diagnosis.broken_data import BrokenChannel, without_broken
 from ident.diagnosis.candidates import Candidate, Trial
+from ident.diagnosis.preparation import preparation
 from ident.diagnosis.products import Floats, Key, Rows
-from ident.diagnosis.recording import record, settled
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.selection import select
 from ident.diagnosis.settings import DiagnosisSettings
@@ -63,20 +64,22 @@ def signature_bench(
     arm: ArmData | None = None,
     reference: Reference | None = None,
     settings: DiagnosisSettings | None = None,
+    broken: Sequence[BrokenChannel] = (),
 ) -> DiagnosisBench:
     """The bench of a diagnosis of sessions, with the tolerated deviations of the nominal arm beside its base.
 
-    Raises DataError, with advice, for unusable sessions.
+    broken : channels to leave out, `Diagnosis.data`. A late channel is as it was recorded. Raises DataError, with
+    advice, for unusable sessions.
     """
     settings = settings or DiagnosisSettings()
     if not sessions:
         raise DataError("no session given; name at least one session file")
-    ordered = sorted(sessions, key=lambda s: s.start)
-    settings = settled(settings, ordered, chain)
-    recordings = [record(s, k, chain, settings) for k, s in enumerate(ordered)]
+    couplings = () if arm is None else arm.couplings
+    ready = preparation(sessions, (), chain, settings, couplings, reference, broken)
+    recordings = without_broken(ready.recordings, broken)
     known = nominal_arm(chain, arm, reference)
-    bench = prepare_bench(known, recordings, settings, reference, (), fit_compliance=reference is None)
-    select(bench.dictionary, bench.evidence, settings)
+    bench = prepare_bench(known, recordings, ready.settings, reference, (), fit_compliance=reference is None)
+    select(bench.dictionary, bench.evidence, ready.settings)
     return bench
 
 

@@ -165,7 +165,9 @@ def foresee(
             further.append(made_up(diagnosis, diagnosis.base_model, experiment, payload, sessions, start))
             last = int(further[-1].joint.log_time[-1])
         try:
-            bench = signature_bench([*sessions, *further], chain, arm=arm, reference=reference)
+            bench = signature_bench(
+                [*sessions, *further], chain, arm=arm, reference=reference, broken=diagnosis.data
+            )
             for k in mine:
                 pair = found[k]
                 a, b = signatures(

@@ -209,6 +209,8 @@ def test_a_reference_is_kept_in_a_file(bench: Any, logs: tuple[Path, Path], tmp_
     reference.save(tmp_path / "healthy.yaml")
     by_path = diagnose(logs[1], bench.chain, reference=str(tmp_path / "healthy.yaml"))
     by_value = diagnose([read_session(logs[1])], bench.chain, reference=reference)
+    assert by_path.details["reference"]
+    assert {row["side"] for row in by_path.details["rows"]} == {"motor", "joint"}
     said = ("cause", "kind", "joint", "parameters")
     assert [[row[k] for k in said] for row in by_path.records()] == [
         [row[k] for k in said] for row in by_value.records()
