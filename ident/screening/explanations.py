@@ -144,14 +144,21 @@ def _best(
         tried += [scored(candidate)[0] for candidate in _likely(_motions(data), tries=_motions(few))]
     tried += [scored(candidate)[0] for candidate in _likely(_of_parts(data, fit, normal), normal)]
     tried = [one for one in tried if believed(one, len(normal.classes))]
-    best = max(enumerate(tried), key=_rank, default=(0, None))[1]
-    if best is not None and best.channel == "payload":
-        # Of two sessions with one label the one carries more, or the other less.
-        others = {one.label: one for one in reversed(tried) if one.channel == "payload" and _alike(one, best)}
-        return replace(best, alike=tuple(one for label, one in sorted(others.items()) if label != best.label))
-    if best is None or best.gain is None or len(best.joints) > 1:
-        return None if best is None else _refined(best, before, normal)
-    return _likeliest(_refined(best, before, normal), _rivals(data, best, gains), before, normal)
+    for _, best in sorted(enumerate(tried), key=_rank, reverse=True):
+        if best.channel == "payload":
+            # Of two sessions with one label the one carries more, or the other less.
+            others = {
+                one.label: one for one in reversed(tried) if one.channel == "payload" and _alike(one, best)
+            }
+            return replace(
+                best, alike=tuple(one for label, one in sorted(others.items()) if label != best.label)
+            )
+        if best.gain is None or len(best.joints) > 1:
+            return _refined(best, before, normal)
+        settled = _measured_again(best, before, normal)
+        if settled is not None:
+            return _likeliest(settled, _rivals(data, best, gains), before, normal)
+    return None
 
 
 def _rivals(data: Redundancy, best: Explanation, gains: Mapping[Class, Gain]) -> Iterator[Explanation]:
@@ -170,7 +177,7 @@ def _likeliest(
     Torques of one joint too large and those of all that share its bodies too small fit alike.
     """
     others = [_measured_again(one, before, normal) for one in rivals]
-    alike = [best, *(one for one in others if one.drop > best.drop - _FINER)]
+    alike = [best, *(one for one in others if one is not None and one.drop > best.drop - _FINER)]
     if len(alike) == 1:
         return best
     data = best.mended
@@ -395,15 +402,18 @@ def _labels(data: Redundancy) -> Iterator[Explanation]:
             yield Explanation("payload", (), looks, replace(data, rows=rows), label=str(record))
 
 
-def _measured_again(candidate: Explanation, before: float, normal: Normal) -> Explanation:
+def _measured_again(candidate: Explanation, before: float, normal: Normal) -> Explanation | None:
     """The gain of a torque from the mended data, while it helps: the wrong channel had bent the bodies that it was
-    measured against."""
+    measured against. None where it does not settle: then the bodies fit the torque the better, the less of it there is.
+    """
+    moved = 1.0
     for _ in range(_ROUNDS):
         better = _corrected(candidate, before, normal)
+        moved = better.factor / candidate.factor
         if better.drop <= candidate.drop:
             break
         candidate = better
-    return candidate
+    return candidate if abs(moved - 1.0) < GAIN else None
 
 
 def _corrected(candidate: Explanation, before: float, normal: Normal) -> Explanation:
@@ -424,10 +434,7 @@ def _corrected(candidate: Explanation, before: float, normal: Normal) -> Explana
 
 
 def _refined(candidate: Explanation, before: float, normal: Normal) -> Explanation:
-    """A gain of a torque measured again; that of a position or the pace of time by steps around the coarse value, each
-    half the last."""
-    if candidate.gain is not None and len(candidate.joints) == 1:
-        return _measured_again(candidate, before, normal)
+    """The gain of a position or the pace of time by steps around the coarse value, each half the last."""
     if abs(candidate.factor) == 1.0 or candidate.channel not in ("position", "time"):
         return candidate
     best, step = candidate, 0.2

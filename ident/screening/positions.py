@@ -32,7 +32,8 @@ class _Kind(NamedTuple):
     size in words.
 
     Without a known error, offsets beyond 3 degrees reach a fall of 0.1 on five real arms and forty simulated ones,
-    gains beyond 10 % one of 0.8 and delays beyond 10 ms one of 0.2, where torques are small.
+    gains beyond 10 % one of 0.8 and delays beyond 10 ms one of 0.2, and of 0.43 in a short recording of one real arm,
+    where torques are small.
     """
 
     least: float
@@ -50,7 +51,7 @@ KINDS: Mapping[str, _Kind] = {
     ),
     "gain": _Kind(0.1, 1.0, 1.0, lambda size, std: f"a gain of {1.0 + size:.3g} ± {std:.1g}"),
     "delay": _Kind(
-        LATE_S, 0.1, 0.4, lambda size, std: f"positions {1e3 * size:.0f} ± {1e3 * std:.1g} ms late"
+        LATE_S, 0.1, 0.6, lambda size, std: f"positions {1e3 * size:.0f} ± {1e3 * std:.1g} ms late"
     ),
 }
 """Kinds of errors; their sizes in rad, recorded over true less one, and s."""

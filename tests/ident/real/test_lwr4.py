@@ -15,6 +15,8 @@ import pytest
 from click.testing import CliRunner
 
 from ident.import_log import LogMapping, import_log
+from ident.rows.filters import SignalSettings
+from ident.screening.screen import screen
 from lwr_driver.configuration import find
 from runner.cli import main
 from tests.ident.real.real_lwr4 import (
@@ -26,6 +28,7 @@ from tests.ident.real.real_lwr4 import (
     needs_recordings,
     relative_percent,
     repeatability,
+    session,
 )
 
 pytestmark = needs_recordings
@@ -121,3 +124,12 @@ def test_the_command_line_does_the_same(tmp_path):
     np.testing.assert_allclose(content["mounting"]["tilt_rad"], mounted((3,)).tilt_rad, rtol=1e-6)
     values = [entry["estimate"] for entry in content["parameters"]]
     np.testing.assert_allclose(values, mounted((3,)).identification.estimate.values, rtol=1e-6, atol=1e-9)
+
+
+def test_a_wrist_with_more_friction_and_cable_than_weight_has_no_wrong_gain():
+    """Each undoing of a gain asks for another one there, up to a factor of 375."""
+    leaning = dataclasses.replace(chain(), gravity=(-0.04638, 0.231, -9.807))
+    slow = SignalSettings(
+        cutoff_hz=3.375, decimate_hz=1.35, reversal_s=0.0, turning_rad=0.0, slow_rad_s=0.0, joint_delay_s=0.0
+    )
+    assert screen([session(3)], leaning, slow) == ()
