@@ -226,7 +226,7 @@ class EstimatorComparison:
         )
         place = kinds.index(chosen)
         contradiction = self._contradiction(candidates, squares)
-        advice += self._worse_joints(candidates, squares, place)
+        advice += [*_lower_by_chance(candidates, place), *self._worse_joints(candidates, squares, place)]
         values, spread = self._gains(chosen)
         readings = zip(chosen[3], values, np.sqrt(np.diag(spread)), strict=True)
         return Choice(
@@ -262,11 +262,18 @@ class EstimatorComparison:
             yield estimator, scale, tilt, beyond_chance
 
     def _preferred(self, best: Sequence[Kind], found: Mapping[Kind, Floats]) -> Kind:
-        """The first of the candidates, or a later one that pays: prior before least squares, upright before leaning."""
+        """The first of the candidates, or a later one that pays: prior before least squares, upright before leaning. A
+        leaning one has to pay against its own estimator upright, too."""
+
+        def pays(before: Kind, after: Kind) -> bool:
+            real = after[2] > before[2] and self._leans(after)
+            return self._pays(found[before], found[after], 0.0 if real else _SURE)
+
+        upright = {kind[0]: kind for kind in best if not kind[2]}
         chosen, *others = best
         for kind in others:
-            real = kind[2] > chosen[2] and self._leans(kind)
-            if self._pays(found[chosen], found[kind], 0.0 if real else _SURE):
+            own = upright.get(kind[0], chosen) if kind[2] else chosen
+            if pays(chosen, kind) and pays(own, kind):
                 chosen = kind
         return chosen
 
@@ -464,6 +471,16 @@ class EstimatorComparison:
                     for label in worse
                 )
                 yield f"least squares predicts single joints better than the chosen estimator: {listed}"
+
+
+def _lower_by_chance(candidates: Sequence[Candidate], chosen: int) -> Iterator[str]:
+    """A candidate of clearly less error than the chosen one, and why it is not that."""
+    mine, least = candidates[chosen], min(candidates, key=lambda one: one.held_back_percent)
+    if least.held_back_percent < (1.0 - _ALIKE) * mine.held_back_percent:
+        yield (
+            f"the lower error of {least.title} is no proof: it is not beyond two standard errors over the parts, and "
+            "then bodies near the URDF's go before least squares, an upright base before a leaning one"
+        )
 
 
 def _tighter(kind: Kind) -> Kind | None:

@@ -305,3 +305,24 @@ def test_least_squares_stays_one_word_away():
     assert found.choice is None
     assert found.estimate.method == "WLS"
     assert np.abs(found.estimate.values - true_base(found)).max() < 5.0
+
+
+def test_a_leaning_base_has_to_pay_against_the_same_estimator_upright(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Least squares are better by chance here, leaning by a little less chance."""
+    share = {("physical", False): 0.02, ("physical", True): 0.03, ("wls", False): 0.016, ("wls", True): 0.018}
+
+    def errors(self: EstimatorComparison, kind: Kind) -> np.ndarray:
+        torque, parts = self.held[:, :, -1, -1].sum(axis=0), len(self.held)
+        uneven = 0.03 * (np.arange(parts) % 2) * (kind[0] == "wls")
+        each = share[kind[0], kind[2]] + uneven - uneven.mean()
+        return each[:, None] / parts * torque
+
+    monkeypatch.setattr(EstimatorComparison, "_errors", errors)
+    monkeypatch.setattr(EstimatorComparison, "_leans", lambda *_: True)
+    monkeypatch.setattr(EstimatorComparison, "_wider", lambda *_: iter(()))
+    found = choose([session(sensors=SENSORS, motor=False, periods=3)], chain(), MODEL_1)
+    assert found.choice is not None
+    assert (found.choice.winner.estimator, found.choice.winner.tilt) == ("physical", False)
+    assert "the lower error of wls is no proof" in str(found.choice)
