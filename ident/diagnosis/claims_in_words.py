@@ -116,7 +116,9 @@ def finding_statement(
     before, after = evidence.get("test_rms_before"), evidence.get("test_rms_after")
     if before and after is not None:
         rows = [f"{joints_text([joint], names)} {side}" for side, joint in evidence.get("rows") or ()]
-        label = ", ".join(["error on held-out data", *rows]) if len(rows) == 1 else "error on held-out data"
+        # Its own share: base and extended model differ by all causes, and without what differs from day to day.
+        label = "error on held-out data, by this cause alone"
+        label += f", {rows[0]}" if len(rows) == 1 else ""
         low, high = evidence.get("gain_interval_95") or (math.nan, math.nan)
         gain = f", less by {low:.3g} to {high:.3g} Nm (95 %)" if low < high else ""
         told = f"{before:.3g} -> {after:.3g} Nm{gain}"

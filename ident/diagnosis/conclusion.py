@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -28,6 +29,8 @@ from ident.diagnosis.wear import is_level, wear
 from ident.effects import EFFECTS
 from ident.model import DynamicModel
 from ident.rows.data_quality import sample_loss
+
+log = logging.getLogger(__name__)
 
 
 def conclude(task: Task, state: State) -> Diagnosis:
@@ -146,7 +149,19 @@ def conclude(task: Task, state: State) -> Diagnosis:
         states={side: _states(nominal, side, told.before.block[side]) for side in nominal.rows},
         torque_base=None if told.errors is None else told.errors[0],
         torque_extended=None if told.errors is None else told.errors[1],
+        torque_present=_of_present(task),
     )
+
+
+def _of_present(task: Task) -> TorqueErrors | None:
+    """Errors of the present model in the test sessions; None without either, or for another arm's model."""
+    if task.model is None or not task.test:
+        return None
+    try:
+        return TorqueErrors.of(task.model, task.test)
+    except DataError as error:
+        log.info("no error of the present model: %s", error)
+        return None
 
 
 class _Told(NamedTuple):

@@ -73,14 +73,17 @@ def moved_parameters(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 def session_errors(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Relative torque error of base and extended model in each test session, the figure of `validate`: plain content;
-    of sessions with both."""
+    of sessions with both. present : of the present model, where there is one."""
     if diagnosis.torque_base is None or diagnosis.torque_extended is None:
         return []
+    present = diagnosis.torque_present
+    known = {} if present is None else {one.session: one.relative for one in present.scores}
     return [
         {
             "session": one.session,
             "by_side": {
                 side: {"base": finite(error), "extended": finite(other.relative.get(side))}
+                | ({"present": finite(known[one.session].get(side))} if one.session in known else {})
                 for side, error in one.relative.items()
             },
         }

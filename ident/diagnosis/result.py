@@ -196,6 +196,7 @@ class Diagnosis(Tabular):
     rms_base, rms_extended : rms error (n,) [Nm] by side in the held-out rows, beside the noise_floor of these rows.
     healthy_left : the same of the base model on the healthy arm of the reference, empty if unknown.
     torque_base, torque_extended : errors of the models in the test sessions with all samples, None without any.
+    torque_present : the same of the present model, None without one.
     referenced : against a healthy arm. notes : sentences on limits of the data. data : broken channels, left out.
     residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN in unused rows.
     states : of the arm in these rows, by side.
@@ -229,6 +230,7 @@ class Diagnosis(Tabular):
     healthy_left: Mapping[str, Floats] = field(default_factory=dict)
     torque_base: TorqueErrors | None = None
     torque_extended: TorqueErrors | None = None
+    torque_present: TorqueErrors | None = None
 
     @property
     def torque_rms_base(self) -> dict[str, Floats]:

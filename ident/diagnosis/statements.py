@@ -508,7 +508,12 @@ def _at(table: Plain, side: str, joint: int) -> float | None:
 
 def _percents(side: str, errors: Plain, is_named: bool) -> str:
     base, extended = (100.0 * errors[name] for name in ("base", "extended"))
-    return f"{side} {base:.2f} %" + (f", extended {extended:.2f} %" if is_named else "")
+    present = errors.get("present")
+    return (
+        f"{side} {base:.2f} %"
+        + (f", extended {extended:.2f} %" if is_named else "")
+        + ("" if present is None else f", present model {100.0 * present:.2f} %")
+    )
 
 
 def _simulated(content: Plain) -> tuple[Plain, Plain]:

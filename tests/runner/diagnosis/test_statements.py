@@ -51,7 +51,7 @@ def test_terminal_and_report_say_the_same(tmp_path: Path) -> None:
     for sentence in (
         said.headline,
         "Viscous nonlinear, joint A2",
-        "error on held-out data",
+        "error on held-out data, by this cause alone",
         "a.mcap",
         "Root mean square errors below are on held-out data: b.mcap.",
         "measured minus simulated",
