@@ -10,9 +10,6 @@ from fri.krl import KrlProgram
 from fri.krl_system import Machinery
 from lwr_driver.configuration import CONFIGS, find
 
-OWN_PROGRAM = "lwr_identification"
-"""The KRL program of this project."""
-
 PUBLISHED = ("stanford", "ros_control", "rcprg")
 """Programs without motor currents of their own."""
 

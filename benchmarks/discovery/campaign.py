@@ -30,7 +30,6 @@ _KINDS = (
     *("single", "single", "none", "single", "pair", "single", "single", "outside", "single", "none"),
     *("single", "single", "pair", "single", "single", "none", "single", "outside", "single", "triple"),
 )
-_SINGLES = _KINDS.count("single")
 _MOTOR_SIDE = 4
 
 

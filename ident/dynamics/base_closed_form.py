@@ -41,7 +41,6 @@ from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, frame_change
 from ident.dynamics.structure import Condition, ModelStructure, Side
 
 _SAME = 1e-9
-_TENSOR = range(6)
 _YY, _ZZ, _MX, _MY, _MZ, _M = 3, 5, 6, 7, 8, 9
 
 

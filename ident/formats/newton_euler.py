@@ -17,8 +17,6 @@ from dataclasses import dataclass
 
 from ident.formats.standard import StandardModel
 
-_COMMUTATIVE = ("add", "mul")
-
 
 @dataclass(frozen=True, eq=False)
 class Expression:
