@@ -108,8 +108,8 @@ class KrcSession:
     """An FRI session at the controller's end.
 
     Parameters: limits of the commands; `q` (7,), KRL's setpoint at the beginning [rad]; policy, None takes the
-    defaults; control mode (``set_strategy`` changes it); `power`, drive bits; `uptime_s`, the controller's clock
-    at the beginning; `first_sequence`, counter of the first packet.
+    defaults; `power`, drive bits; `uptime_s`, the controller's clock at the beginning; `first_sequence`, counter of the
+    first packet. The control mode is position until ``set_strategy``.
 
     Attributes
     ----------
@@ -140,7 +140,6 @@ class KrcSession:
         q: ArrayLike,
         policy: KrcPolicy | None = None,
         *,
-        control: Control = Control.POSITION,
         power: int = ALL_DRIVES,
         uptime_s: float = 0.0,
         first_sequence: int = 0,
@@ -150,7 +149,7 @@ class KrcSession:
         self.state = State.OFF
         self.quality = Quality.UNACCEPTABLE
         self.quality_ceiling = Quality.PERFECT
-        self.control = control
+        self.control = Control.POSITION
         self.power = power
         self.error = 0
         self.warning = 0

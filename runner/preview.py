@@ -34,6 +34,8 @@ from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, named_p
 
 Floats = NDArray[np.float64]
 
+# Of the motion shown, of the checks beside it too: ten rows a frame.
+_PERIOD_S = 0.005
 _FRAMES_PER_S = 20.0
 _MOST_FRAMES = 1500
 _CLEARANCES = 400
@@ -110,7 +112,7 @@ class Planned:
         )
 
 
-def planned_motion(file: str, *, session: str | None = None, period_s: float = 0.005) -> Planned:
+def planned_motion(file: str, *, session: str | None = None) -> Planned:
     """The motion of an experiment file, of the folder of an experiment with its plan, or of a plan file.
 
     session : of the experiment; by default the one with the heaviest payload. A plan alone is shown with the
@@ -126,7 +128,7 @@ def planned_motion(file: str, *, session: str | None = None, period_s: float = 0
     else:
         path = find(file)
         if read_mapping(path).get("kind") == "excitation plan":
-            return _of_plan(path, period_s)
+            return _of_plan(path)
         experiment = Experiment.load(path)
     arm = Arm.load(experiment.arm, beside=experiment.folder)
     cell = Cell.load(experiment.cell, beside=experiment.folder)
@@ -135,7 +137,7 @@ def planned_motion(file: str, *, session: str | None = None, period_s: float = 0
         raise ConfigurationError(f"session {session!r} is not in {path}; it has {', '.join(plans)}")
     heaviest = max(experiment.sessions, key=lambda one: 0.0 if one.payload is None else one.payload.mass)
     plan = plans[session] if session is not None else heaviest
-    rows = Excitations.of(experiment, arm, cell, results).rows(plan, period_s)
+    rows = Excitations.of(experiment, arm, cell, results).rows(plan, _PERIOD_S)
     home = experiment.home(len(arm.joint_names))
     motion, preflight = session_motion(experiment, arm, cell, plan, rows, home)
     margin = max(experiment.moves.clearance_m, cell.margin_m)
@@ -143,7 +145,7 @@ def planned_motion(file: str, *, session: str | None = None, period_s: float = 0
     return Planned(title, arm, cell, plan.payload, motion, preflight, margin)
 
 
-def _of_plan(path: Path, period_s: float) -> Planned:
+def _of_plan(path: Path) -> Planned:
     arm, cell = Arm.load(), Cell.load()
     plan = ExcitationPlan.load(path)
     if plan.joint_names != arm.joint_names:
@@ -151,7 +153,7 @@ def _of_plan(path: Path, period_s: float) -> Planned:
             f"{path}: joints {', '.join(plan.joint_names)} are not those of {arm.name}; preview an experiment "
             "file with that arm"
         )
-    motion = excitation_rows(plan, 1)(period_s)
+    motion = excitation_rows(plan, 1)(_PERIOD_S)
     items = [
         *check_motion_limits(arm, motion),
         check_torque(arm, motion, None),

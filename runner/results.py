@@ -132,9 +132,9 @@ def _same_arm(urdf: Path, chain: Chain) -> bool:
     return other.n == chain.n and all(np.allclose(one, two, atol=1e-6) for one, two in pairs)
 
 
-def agreement(parameters: Sequence[dict[str, Any]], sigmas: float = 3.0) -> float:
-    """Share of the estimates within `sigmas` standard deviations of the truth."""
-    inside = [within(entry, sigmas) for entry in parameters if "truth" in entry]
+def agreement(parameters: Sequence[dict[str, Any]]) -> float:
+    """Share of the estimates within three standard deviations of the truth."""
+    inside = [within(entry) for entry in parameters if "truth" in entry]
     return sum(inside) / len(inside) if inside else math.nan
 
 

@@ -261,27 +261,19 @@ def random_states(
     return q, rng.uniform(-2.0, 2.0, shape), rng.uniform(-5.0, 5.0, shape)
 
 
-def numeric_base(
-    structure: ModelStructure,
-    conditions: Sequence[Condition] | None = None,
-    *,
-    samples: int | None = None,
-    seed: int = 0,
-) -> BaseSet:
+def numeric_base(structure: ModelStructure, conditions: Sequence[Condition] | None = None) -> BaseSet:
     """Base parameters of the stack of `conditions` (default: the bare arm and every payload, all sides).
 
-    samples : random states for each condition; the default gives three rows for each column.
-
-    Columns are scaled to norm 1. The rank is at the largest ratio of consecutive singular values, the smaller
-    below 1e-8 of the largest. Raises DataError without a clear gap (1e3), for a nearly degenerate geometry.
+    The random states, the same in each call, give three rows for each column. Columns are scaled to norm 1. The rank is
+    at the largest ratio of consecutive singular values, the smaller below 1e-8 of the largest. Raises DataError without
+    a clear gap (1e3), for a nearly degenerate geometry.
     """
     stack = tuple(conditions) if conditions is not None else structure.conditions()
     if not stack:
         raise DataError("no condition was given; at least one session's payload and sides are needed")
-    rng = np.random.default_rng(seed)
-    if samples is None:
-        rows = structure.chain.n * sum(len(structure.condition_sides(condition)) for condition in stack)
-        samples = max(16, -(-3 * structure.n_columns // rows))
+    rng = np.random.default_rng(0)
+    rows = structure.chain.n * sum(len(structure.condition_sides(condition)) for condition in stack)
+    samples = max(16, -(-3 * structure.n_columns // rows))
     parts = [
         structure.regressor(
             *random_states(structure, samples, rng),

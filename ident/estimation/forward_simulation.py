@@ -31,6 +31,8 @@ from ident.rows.prepared import PreparedSession
 from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session
 
+# Of the position controller: above the frequencies of the motion, which it must follow, and far below those of a step.
+_BANDWIDTH_HZ = 20.0
 _WIDTH_RAD_S = 5e-3
 _IMPLICIT = 0.6
 _LOST_RAD = 1.0
@@ -125,7 +127,6 @@ def simulate_session(
     session: Session,
     *,
     settings: SignalSettings | None = None,
-    bandwidth_hz: float = 20.0,
     step_s: float = 1e-3,
 ) -> ForwardSimulation:
     """Simulate the longest uninterrupted stretch of a session.
@@ -152,10 +153,8 @@ def simulate_session(
     else:
         reference, target = "commanded", command
     payload = mounted(model, session)
-    q, qd, torque = simulate(
-        model, times, target, payload=payload, side=side, start=measured[0], bandwidth_hz=bandwidth_hz
-    )
-    settle = times > first + 3.0 / bandwidth_hz
+    q, qd, torque = simulate(model, times, target, payload=payload, side=side, start=measured[0])
+    settle = times > first + 3.0 / _BANDWIDTH_HZ
     return ForwardSimulation(
         session=prepared.name,
         joint_names=prepared.joint_names,
@@ -179,7 +178,6 @@ def simulate(
     payload: str | None = None,
     side: Side = "motor",
     start: Floats | None = None,
-    bandwidth_hz: float = 20.0,
 ) -> tuple[Floats, Floats, Floats]:
     """Position, velocity and torque (N, n) of the model under position control along `target` (N, n) at `times`.
 
@@ -200,7 +198,7 @@ def simulate(
         )
     own = np.einsum("nii->ni", inertia).max(axis=0)
     added = inertia[0] - model.mass_matrix(target[:1], payload=payload)[0]
-    frequency = 2.0 * math.pi * bandwidth_hz
+    frequency = 2.0 * math.pi * _BANDWIDTH_HZ
     stiffness, damping = frequency**2 * own, 2.0 * frequency * own
     rate = np.gradient(target, times, axis=0)
     acceleration = np.gradient(rate, times, axis=0)

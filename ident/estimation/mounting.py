@@ -45,6 +45,12 @@ from ident.rows.sessions import require
 from ident.screening.screen import without_dead
 from lwr_driver.session import Session, Sessions, as_sessions
 
+# Standard deviation of the tilt before the data. It hardly matters beside a tenth of a degree from the data, and keeps
+# an unexcited angle at zero.
+_PRIOR_STD_RAD = float(np.deg2rad(2.0))
+# A few steps suffice, see above; a search that needs more of them has not converged.
+_MOST_STEPS = 6
+
 
 @dataclass(frozen=True)
 class Mounting:
@@ -116,9 +122,7 @@ def find_mounting(
     chain: Chain,
     settings: IdentificationSettings | None = None,
     *,
-    prior_std_rad: float = float(np.deg2rad(2.0)),
     prior_strength: float = 1.0,
-    steps: int = 6,
     known: Known | None = None,
 ) -> Mounting:
     """Tilt of the base of `chain` from the sessions, and the arm identified under it.
@@ -127,8 +131,6 @@ def find_mounting(
         prior (`cad_prior`; weighted least squares without one), so that weakly excited parameters do not
         absorb the tilt.
     prior_strength : factor on the variance of that prior.
-    prior_std_rad : standard deviation of the tilt before the data. It hardly matters beside a tenth of a degree
-        from the data, and keeps an unexcited angle at zero.
 
     The standard deviations are the larger of the block jackknife's and the posterior's; those of the arm's
     parameters do not include the tilt's.
@@ -152,9 +154,9 @@ def find_mounting(
     inner = found.settings
     done, converged = 0, False
     covariance = None
-    while done < steps and not converged:
+    while done < _MOST_STEPS and not converged:
         done += 1
-        prior = _prior(found, tilt, prior_std_rad, prior_strength)
+        prior = _prior(found, tilt, prior_strength)
         step, covariance = _step(found, sessions, axes, prior)
         tilt = tilt + step
         turned = replace(chain, gravity=_turned(chain.gravity, axes, tilt))
@@ -306,7 +308,7 @@ def _at_rest(session: PreparedSession) -> PreparedSession:
     return replace(session, passages=passages)
 
 
-def _prior(found: Identification, tilt: Floats, prior_std_rad: float, strength: float) -> Prior:
+def _prior(found: Identification, tilt: Floats, strength: float) -> Prior:
     """The arm's prior, `strength` times its variance, with the tilt's: zero for the whole tilt, earlier steps
     included."""
     p = len(found.base.names)
@@ -315,5 +317,5 @@ def _prior(found: Identification, tilt: Floats, prior_std_rad: float, strength: 
         arm = cad_prior(found.base).prior("pullback")
         mean[:p], precision[:p, :p] = arm.mean, arm.precision / strength
     mean[p:] = -tilt
-    precision[p, p] = precision[p + 1, p + 1] = prior_std_rad**-2
+    precision[p, p] = precision[p + 1, p + 1] = _PRIOR_STD_RAD**-2
     return Prior(mean, precision)

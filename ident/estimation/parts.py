@@ -25,12 +25,10 @@ PARTS = 8
 fewer parts every candidate extrapolates beyond any use, with more of them a part has its like in the rest."""
 
 
-def held_back_parts(
-    problem: Problem, payloads: Sequence[str | None], block: int, count: int = PARTS
-) -> list[NDArray[np.int64]]:
+def held_back_parts(problem: Problem, payloads: Sequence[str | None], block: int) -> list[NDArray[np.int64]]:
     """Number of the part of each row, for each row group; all -1 for a motion too short for two parts.
 
-    block : rows of a block. count : number of parts, fewer for fewer than two blocks a part.
+    block : rows of a block. With fewer than two blocks a part there are fewer parts.
     """
     labels = {c.label: k for k, c in enumerate(problem.classes)}
     size = len(problem.names)
@@ -57,7 +55,7 @@ def held_back_parts(
     centres: Floats | None = None
     conditions = list(dict.fromkeys(payloads[record] for record, _ in sums))
     members = {c: [key for key in sums if payloads[key[0]] == c] for c in conditions}
-    count = min(count, *(len(keys) // 2 for keys in members.values()))
+    count = min(PARTS, *(len(keys) // 2 for keys in members.values()))
     if count < 2:
         return [np.full(len(group.target), -1) for group in problem.groups]
     for keys in members.values():

@@ -35,6 +35,8 @@ from lwr_driver.session import Session, Sessions, as_sessions
 
 # Torque error on held-out data from which a model is of no use there.
 _POOR = 0.2
+# Sessions in a `repr`: what a screen holds beside the rest.
+_SHOWN = 8
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ class Validation(Tabular):
         return "\n".join(
             [
                 f"Validation of the model of {self.robot}: sessions: {len(self.scores)}{rivals}",
-                *_few([f"  {score!r}" for score in self.scores], 8),
+                *_few([f"  {score!r}" for score in self.scores]),
             ]
         )
 
@@ -313,10 +315,10 @@ def prepared_session(
     return prepare(chosen, signals, motor=_has_motor(model), advise=advise, blocks=blocks)
 
 
-def _few(lines: Sequence[str], count: int) -> list[str]:
+def _few(lines: Sequence[str]) -> list[str]:
     """The first lines, and a line with the number of the others."""
-    left = len(lines) - count
-    return [*lines[:count], *([f"  and {left} more"] if left > 0 else [])]
+    left = len(lines) - _SHOWN
+    return [*lines[:_SHOWN], *([f"  and {left} more"] if left > 0 else [])]
 
 
 @dataclass(frozen=True)
@@ -353,7 +355,7 @@ class CrossValidation(Tabular):
         return "\n".join(
             [
                 f"Cross-validation: sessions left out in turn: {len(self.scores)}, skipped: {len(self.skipped)}",
-                *_few([f"  {score!r}" for score in self.scores], 8),
+                *_few([f"  {score!r}" for score in self.scores]),
             ]
         )
 

@@ -46,6 +46,8 @@ _FAR = 0.6
 _FAR_TORQUE = 0.2
 _SPACE_SCALE = 0.1
 _FLANGE_SCALE = 0.3
+# Share of the torque limits kept for the moments between the samples, where the torque has no known peak.
+_TORQUE_RESERVE = 0.01
 _RATIO_SLOPE = 0.03  # typical change of a wrist torque's log ratio per radian of a coefficient
 
 
@@ -77,7 +79,6 @@ class Constraints:
         bounds: Sequence[Bound] = (),
         *,
         coverage: float = 3.0,
-        torque_reserve: float = 0.01,
     ) -> None:
         self.evaluator, self.limits, self.space = evaluator, limits, space
         self.floor = np.array(floor, dtype=np.float64)
@@ -88,7 +89,7 @@ class Constraints:
         halves = np.array([0.5 * (limits.q_high - limits.q_low), limits.v_max, limits.a_max, limits.j_max])
         factor = [evaluator.basis.grid_factor(evaluator.fine, order) for order in range(4)]
         self.half = halves / np.array(factor)[:, None]
-        self.torque_limit = limits.tau_max * (1.0 - torque_reserve)
+        self.torque_limit = limits.tau_max * (1.0 - _TORQUE_RESERVE)
         self.tracked = [row for row in range(space.rows) if np.isfinite(self.floor[row])]
         self.scale = np.where(np.arange(space.rows) < 2, _FLANGE_SCALE, _SPACE_SCALE)
         self.deviation = np.zeros((2, evaluator.loads.shape[0], evaluator.samples, n))

@@ -475,11 +475,11 @@ class Excitation:
         return highest
 
 
-def excitation_frequency(velocity: Floats, dt: float, share: float = 0.999) -> float:
+def excitation_frequency(velocity: Floats, dt: float) -> float:
     """Upper frequency [Hz] of the motion of velocities (n, J), low-passed and equidistant: see `Excitation`."""
     found = Excitation(len(velocity), dt)
     found.add(velocity)
-    return found.frequency(share)
+    return found.frequency()
 
 
 def advice(

@@ -18,6 +18,8 @@ from runner.report.plot import Panel, Role
 
 Floats = NDArray[np.float64]
 _SCREEN_FONT = "DejaVu Sans"  # comes with matplotlib
+# Width of a drawing for a page, which stretches it to its place: it sets the size of the texts beside the lines.
+_DRAWN_MM = 105.0
 
 
 @dataclass(frozen=True)
@@ -126,9 +128,9 @@ class MatrixFigure(Drawing):
         return np.array([draw_matrix(self.names, self.values, DIVERGING, width, shown=shown)], dtype=object)
 
 
-def inline_svg(panel: Panel, width: float = 105.0) -> str:
-    """One panel as an SVG element for a page, as wide as its place; width [mm] is that of its texts."""
-    axes = draw_panels([panel], width, font=_SCREEN_FONT)
+def inline_svg(panel: Panel) -> str:
+    """One panel as an SVG element for a page, as wide as its place."""
+    axes = draw_panels([panel], _DRAWN_MM, font=_SCREEN_FONT)
     stream = io.StringIO()
     with paper_style(_SCREEN_FONT):
         axes.flat[0].figure.savefig(stream, format="svg", metadata={"Date": None})
