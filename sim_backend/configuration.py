@@ -80,7 +80,7 @@ class RobotConfig:
     gravity : acceleration of gravity in the axes of the base [m/s^2]; (0, 0, 9.81) for an arm at the ceiling
     stiffness [Nm/rad], damping [Nm s/rad] of the joints; brake_torque [Nm]
     substeps : steps of the joint dynamics within 1 ms
-    effects : physics beyond the nominal equations (see `sim_backend.plant.Effect`)
+    effects : physics beyond the nominal equations (see `sim_backend.plant.PlantEffect`)
     plant : other physics altogether, called with `model, drive, random, **options` (see
     `sim_backend.plant.Plant`); the `effects` act on its sensors only
     """

@@ -1,7 +1,7 @@
 """The arm itself: elastic joints, friction and rigid links, advanced 1 ms at a time.
 
 `Plant` is the interface of the physics to the rest of the emulator; tests put other physics in its place.
-`ElasticArm` is the plant of the default emulator, an `Effect` an addition to its equations.
+`ElasticArm` is the plant of the default emulator, a `PlantEffect` an addition to its equations.
 """
 
 from __future__ import annotations

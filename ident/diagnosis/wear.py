@@ -2,7 +2,7 @@
 
 A change of friction or drive inertia leaves no residual, for the base parameters absorb it. Against a reference it
 shows in the parameters themselves: estimated by these sessions alone, beside all claims, their difference from the
-healthy ones is compared with both uncertainties and with the arm's changes from day to day (`reference.habit`), joint
+healthy ones is compared with both uncertainties and with the arm's changes from day to day (`day_spread.habit`), joint
 by joint (Hotelling's T^2). What a claim on the same torque moves in these parameters is no evidence, for its law and
 theirs share the friction between them; nor is a change beside a larger remainder without a name: what leaves the
 remainder bends the parameters, too. The sensors' gains differ from day to day, and a relative error of a joint's two

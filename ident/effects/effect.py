@@ -229,7 +229,7 @@ class Reading(Protocol):
 
 
 class Simulated:
-    """An effect in a simulated arm, called each millisecond like `sim_backend.plant.Effect`.
+    """An effect in a simulated arm, called each millisecond like `sim_backend.plant.PlantEffect`.
 
     joint : from 0. values, form : of the parameters. coefficients : of the columns. state : memory of the effect.
     """

@@ -1,7 +1,7 @@
 """The arm as motion planning needs it: geometry as plain arrays, the present estimate of the dynamics, torques.
 
-`ident.kinematics.Chain` is the source of every number of `Mechanism`. The compiled sweeps over the samples cannot
-read objects, hence the contiguous arrays; the flange is here for the workspace limits alone.
+`ident.dynamics.kinematics.Chain` is the source of every number of `Mechanism`. The compiled sweeps over the samples
+cannot read objects, hence the contiguous arrays; the flange is here for the workspace limits alone.
 
 `ArmEstimate` holds parameter values, their uncertainty and the noise: for the torque limits, for the predicted
 relative standard deviations and for the weights of the rows. Each new identification replaces it.

@@ -133,7 +133,7 @@ class SensorChain(PlantEffect):
         self._begun = False
 
     def start(self, joints: int, random: np.random.Generator) -> None:
-        """See `sim_backend.plant.Effect`."""
+        """See `sim_backend.plant.PlantEffect`."""
         self._random = random
         self._slack = np.zeros(joints)
         self._rows = np.zeros((2, _MEMORY, joints))
