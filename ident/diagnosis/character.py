@@ -231,7 +231,7 @@ def _carried(trials: Sequence[Trial | None], settings: DiagnosisSettings) -> boo
         [s.coefficients for s in scores],
         [s.covariance for s in scores],
         effect.usual_change,
-        blocks=sum(s.robust()[1] for s in scores),
+        blocks=sum(s.uncertainty[1] for s in scores),
     )
     visible = float(np.mean([score.inflation for score in scores]))
     return (

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from ident.diagnosis.candidates import Dictionary, Trial
 from ident.diagnosis.evidence import Evidence
 from ident.diagnosis.products import Floats, Key, Rows
+from ident.diagnosis.score import widened
 
 # Largest last step of a shape parameter over its value, for the linearisation to hold.
 _NEAR = 0.3
@@ -113,6 +114,4 @@ def _clustered(evidence: Evidence) -> Floats:
     if evidence.prior is not None:
         p = evidence.base_count
         covariance += inverse[:, :p] @ evidence.prior[0] @ inverse[:p]
-    least = np.maximum(np.diag(inverse), 0.0)
-    widen = np.sqrt(np.maximum(least / np.maximum(np.diag(covariance), 1e-300), 1.0))
-    return covariance * np.outer(widen, widen)
+    return widened(covariance, inverse)

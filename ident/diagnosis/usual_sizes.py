@@ -163,7 +163,7 @@ def scores(dictionary: Dictionary) -> Table:
 
 def _settled(score: Score) -> Score:
     """The score with its covariance, without the products that it is made of."""
-    covariance, blocks = score.robust()
+    covariance, blocks = score.uncertainty
     return replace(score, robust=lambda: (covariance, blocks))
 
 
