@@ -10,6 +10,7 @@ import numpy as np
 
 if TYPE_CHECKING:  # the words about a diagnosis need a constant of this module, and no search
     from ident.diagnosis.evidence import Evidence
+    from ident.diagnosis.nominal import SideRows
     from ident.diagnosis.products import Floats, Key, Rows
 
 _DRAWS = 1000
@@ -54,9 +55,18 @@ def held_out(evidence: Evidence, extra: Sequence[Rows]) -> HeldOut:
     evidence.replace(extra)
     rows = evidence.nominal.rows
     if any(side.test.any() for side in rows.values()):
-        blocks = {side: np.floor(r.time / 2.0) + 1e6 * r.session for side, r in rows.items()}
-        return HeldOut(evidence.residuals(test=True), blocks)
+        return HeldOut(evidence.residuals(test=True), _blocks_of(rows, evidence.settings.block_s))
     return HeldOut(evidence.held_residuals(), {side: evidence.block_of(side) for side in rows})
+
+
+def _blocks_of(rows: Mapping[str, SideRows], block_s: float) -> dict[str, Floats]:
+    """Number (m,) by side of each row's block of `block_s` of its session, the same on all sides."""
+    pairs = [
+        np.stack([r.session, np.floor(r.time / block_s).astype(np.int64)], axis=1) for r in rows.values()
+    ]
+    number = np.unique(np.concatenate(pairs), axis=0, return_inverse=True)[1].ravel()
+    ends = np.cumsum([len(pair) for pair in pairs])
+    return dict(zip(rows, np.split(number.astype(float), ends[:-1]), strict=True))
 
 
 def interval(
