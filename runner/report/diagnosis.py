@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fri.errors import ConfigurationError, DataError
-from ident.diagnosis.claims_in_words import Comparison, FindingStatement
+from ident.diagnosis.claims_in_words import Comparison, FindingStatement, capital
 from ident.diagnosis.look_alikes import LookAlikes
 from ident.diagnosis.statements import Number, Part, Statements, run_advice, statements
 from runner.diagnosis.records import (
@@ -155,8 +155,8 @@ def diagnosis_parts(diagnosis: DiagnosisFolder) -> list[tuple[str, str, str]]:
 
 def _finding(diagnosis: DiagnosisFolder, said: FindingStatement) -> str:
     finding = diagnosis.claims[said.number - 1]
-    side, joints, title = str(finding.get("side", "")), finding.get("joints", []), _capital(said.title)
-    text = f"{said.text} {_capital(said.confidence)}.".strip()
+    side, joints, title = str(finding.get("side", "")), finding.get("joints", []), capital(said.title)
+    text = f"{said.text} {capital(said.confidence)}.".strip()
     facts = table(("", ""), said.facts, f"Evidence: {title}", classes="facts")
     parts = [f"<h3>{escape(title)}</h3>", paragraph(text), facts]
     if diagnosis.residuals is not None and side != "timing":
@@ -177,7 +177,7 @@ def _beside(diagnosis: DiagnosisFolder, said: Comparison) -> str:
     figure = look_alike_figure(pairs[said.place], diagnosis.joint_names) if pairs else None
     return (
         f"<h4>Side by side: {escape(said.title)}</h4>"
-        f"{paragraph(f'{_capital(said.overlap)}.')}"
+        f"{paragraph(f'{capital(said.overlap)}.')}"
         f"{paragraph(f'To decide: {said.decides}.') if said.decides else ''}"
         f"{'' if figure is None else figure_html(figure)}"
     )
@@ -185,7 +185,7 @@ def _beside(diagnosis: DiagnosisFolder, said: Comparison) -> str:
 
 def _part(diagnosis: DiagnosisFolder, said: Part) -> str:
     if said.anchor == "limits":
-        return f"<ul>{''.join(f'<li>{escape(_capital(note))}.</li>' for note in said.sentences)}</ul>"
+        return f"<ul>{''.join(f'<li>{escape(capital(note))}.</li>' for note in said.sentences)}</ul>"
     html = "".join(map(paragraph, said.sentences)) + (_table(said) if said.rows else "")
     if said.anchor == "deciding":
         html += paragraph(run_advice(None if diagnosis.experiment is None else diagnosis.experiment.name))
@@ -218,10 +218,6 @@ def _residuals(diagnosis: DiagnosisFolder) -> str:
         figure for side in residuals.sides for figure in residual_figures(residuals, side, joints="names")
     )
     return "".join(fold(figure.caption, figure_html(figure)) for figure in figures)
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _json(path: Path) -> Mapping[str, Any]:

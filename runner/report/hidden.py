@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
+from ident.diagnosis.claims_in_words import capital
 from runner.hiding.reveal import revealed
 from runner.report.folder import ResultFolder
 from runner.report.markup import Cell, paragraph, section, table
@@ -19,7 +20,7 @@ def hidden_section(results: ResultFolder) -> str:
         if shown is not None:
             rows: list[list[Cell]] = [list(row) for row in shown.rows()]
             head = ("parameter", "truth", "found", "error / std")
-            parts = [paragraph(f"{text[:1].upper()}{text[1:]}.") for text in (shown.truth, shown.verdict)]
+            parts = [paragraph(f"{capital(text)}.") for text in (shown.truth, shown.verdict)]
             label = "Hidden effect, truth and finding"
             return section("hidden", "The hidden effect", *parts, table(head, rows, label))
         return section(

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ident.diagnosis.claims_in_words import capital
 from ident.diagnosis.statements import in_short
 from ident.model import DynamicModel
 from runner.report.folder import Curves, ResultFolder
@@ -154,7 +155,7 @@ def _torque_error(subject: str, unseen: bool, results: ResultFolder) -> Verdict 
             level = "bad"
         elif not all(one.relative <= limit for one, limit in sought.items()) and level == "good":
             level = "look"
-    return Verdict(subject, ". ".join(map(_capital, parts)), f"below {'; '.join(wanted)}", level, "torque")
+    return Verdict(subject, ". ".join(map(capital, parts)), f"below {'; '.join(wanted)}", level, "torque")
 
 
 def _torque_limit(one: Curves, model: DynamicModel) -> float:
@@ -350,7 +351,3 @@ def _leading(text: str) -> float:
 
 def _listed(names: list[str]) -> str:
     return ", ".join(dict.fromkeys(names))
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
