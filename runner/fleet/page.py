@@ -6,11 +6,12 @@ from html import escape
 
 import numpy as np
 
+from ident.diagnosis.statements import Number
 from ident.monitoring import Series
 from runner.computer import versions
 from runner.fleet.trend import ArmTrend, FleetTrend, Named, as_day
 from runner.report.figure import Figure
-from runner.report.markup import Cell, Number, figure_html, fold, paragraph, section, table
+from runner.report.markup import Cell, figure_html, fold, paragraph, section, table
 from runner.report.page import page_html
 from runner.report.plot import Line, Mark, Panel, Points
 from runner.report.verdicts import Level, Verdict

@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ident.diagnosis.statements import Number
 from ident.estimation.compare import Comparison, Difference
 from ident.model import DynamicModel
 from runner.computer import versions
 from runner.report.figure import Figure
 from runner.report.folder import ResultFolder
-from runner.report.markup import Cell, Number, figure_html, paragraph, section, table
+from runner.report.markup import Cell, figure_html, paragraph, section, table
 from runner.report.page import page_html
 from runner.report.plot import Line, Mark, Panel, Points
 from runner.report.verdicts import Level, Verdict

@@ -13,7 +13,7 @@ from typing import Any
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.claims_in_words import Comparison, FindingStatement, capital
 from ident.diagnosis.look_alikes import LookAlikes
-from ident.diagnosis.statements import Number, Part, Statements, run_advice, statements
+from ident.diagnosis.statements import Part, Statements, run_advice, statements
 from runner.diagnosis.records import (
     LOOK_ALIKES,
     REPLAY,
@@ -32,7 +32,6 @@ from runner.report.figure import Figure
 from runner.report.figures import pretty_unit
 from runner.report.folder import ResultFolder
 from runner.report.markup import Cell, figure_html, fold, paragraph, section, table
-from runner.report.markup import Number as Shown
 from runner.report.paper import joint_labels
 
 
@@ -202,10 +201,8 @@ def _part(diagnosis: DiagnosisFolder, said: Part) -> str:
 def _table(said: Part) -> str:
     units = said.head.index("unit") if "unit" in said.head else -1
 
-    def shown(place: int, cell: str | Number) -> Cell:
-        if isinstance(cell, Number):
-            return Shown(cell.value, cell.form, cell.key)
-        return pretty_unit(cell) if place == units else cell
+    def shown(place: int, cell: Cell) -> Cell:
+        return pretty_unit(cell) if place == units and isinstance(cell, str) else cell
 
     return table(said.head, [[shown(*one) for one in enumerate(row)] for row in said.rows], said.title)
 

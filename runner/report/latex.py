@@ -15,9 +15,10 @@ import re
 from pathlib import Path
 
 from fri.errors import ConfigurationError
+from ident.diagnosis.statements import Number
 from runner.report import tables
 from runner.report.folder import ResultFolder
-from runner.report.markup import Cell, Number
+from runner.report.markup import Cell
 from runner.report.tables import Table
 
 Results = ResultFolder | str | Path

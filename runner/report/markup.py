@@ -4,40 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
+from ident.diagnosis.statements import Number
 from runner.report.figure import Figure
 from runner.report.interactive import chart_json, panel_chart
 from runner.report.plot import STYLES, Role
-
-
-@dataclass(frozen=True)
-class Number:
-    """A number in a table: shown short, all its digits in the markup, named by its key in summary.json."""
-
-    value: float | None
-    form: str = ".4g"
-    key: str = ""
-
-    def html(self) -> str:
-        """The number as text, or a dash."""
-        if self.value is None or not math.isfinite(self.value):
-            return "–" if self.value is None or math.isnan(self.value) else "∞"
-        key = f" data-key='{escape(self.key, quote=True)}'" if self.key else ""
-        shown = format(self.value, self.form)
-        if not shown.strip("+-0."):
-            shown = shown.lstrip("+-")
-        shown = shown.replace("-", "\N{MINUS SIGN}")
-        return f"<data value='{self.value!r}'{key}>{shown}</data>"
-
 
 Cell = str | Number
 
 _NUMBER = " class=n"
 _DATA = ("<script type='application/json'>", "</script>")
 _SIGNS = {"circle": "\N{BLACK CIRCLE}", "cross": "\N{MULTIPLICATION SIGN}", "diamond": "\N{WHITE DIAMOND}"}
+
+
+def number_html(number: Number) -> str:
+    """A number as text with all its digits and its key in the markup, or a dash."""
+    if number.value is None or not math.isfinite(number.value):
+        return "–" if number.value is None or math.isnan(number.value) else "∞"
+    key = f" data-key='{escape(number.key, quote=True)}'" if number.key else ""
+    shown = format(number.value, number.form)
+    if not shown.strip("+-0."):
+        shown = shown.lstrip("+-")
+    shown = shown.replace("-", "\N{MINUS SIGN}")
+    return f"<data value='{number.value!r}'{key}>{shown}</data>"
 
 
 def table(
@@ -62,7 +53,7 @@ def table(
         cells = []
         for place, cell in enumerate(row):
             number = isinstance(cell, Number)
-            text = cell.html() if isinstance(cell, Number) else escape(cell)
+            text = number_html(cell) if isinstance(cell, Number) else escape(cell)
             if place == 0:
                 cells.append(f"<th scope=row>{text}</th>")
             else:

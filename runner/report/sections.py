@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
+from ident.diagnosis.statements import Number
 from runner.published import SOURCE, TABLE_2
 from runner.report import tables
 from runner.report.figures import (
@@ -21,7 +22,6 @@ from runner.report.figures import (
 from runner.report.folder import ResultFolder
 from runner.report.markup import (
     Cell,
-    Number,
     chart_html,
     conditions_table,
     figure_html,

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from ident.diagnosis.statements import Number
 from runner.published import REBUILT, TABLE_1, TABLE_2, PredictedMotion, planned, rebuilt
 from runner.report.figures import interval_95, pretty_unit
 from runner.report.folder import ResultFolder
-from runner.report.markup import Cell, Number
+from runner.report.markup import Cell
 
 _WORDS: dict[bool | None, str] = {True: "yes", False: "no", None: "–"}
 _OBJECTIVES = {
