@@ -24,6 +24,7 @@ from lwr_driver.session import Session
 from runner.encoder import encoder_of
 from runner.estimation import known_arm
 from runner.experiment_file import Payload
+from runner.file_names import MODEL, SUMMARY
 from runner.replay import Encoder, Replay, Replayed, attached_experiment
 from runner.report.folder import ResultFolder
 from runner.report.plot import STYLES
@@ -143,7 +144,7 @@ def motion_replay(
     """
     log, others = _session(source, session)
     folder = source if source.is_dir() else source.parent
-    base = _present(model or folder / "model.yaml", f"{source}: no model beside the log", "--model FILE")
+    base = _present(model or folder / MODEL, f"{source}: no model beside the log", "--model FILE")
     beside = folder / "diagnosis/model_extended.yaml"
     if extended is not None:
         _present(extended, f"{source}: no extended model", "--extended FILE")
@@ -194,7 +195,7 @@ def _session(source: Path, name: str | None) -> tuple[Session, list[Session]]:
         raise ConfigurationError(f"--session {name}: {source} is a log; name the folder of its experiment")
     folder = source if source.is_dir() else source.parent
     if source.is_file():
-        of_run = ResultFolder.load(folder).sessions if (folder / "summary.json").is_file() else {}
+        of_run = ResultFolder.load(folder).sessions if (folder / SUMMARY).is_file() else {}
         log = next((one for one in of_run.values() if one.path.name == source.name), None)
         if log is None:
             log, of_run = read_recording(source, status=False), {}

@@ -31,6 +31,7 @@ from runner.computer import versions
 from runner.estimation import named_model
 from runner.experiment import Record
 from runner.experiment_file import Experiment
+from runner.file_names import MODEL, SUMMARY
 from runner.published import characteristics
 from runner.terminal import write_json
 from sim_backend.configuration import load_configuration
@@ -260,16 +261,16 @@ def write_results(
     report = _report(experiment, summary, found)
     if found is not None:
         files = {file["path"]: file["sha256"] for file in summary.get("files", ())}
-        write_model(named_model(found.model, arm.name, files), folder / "model.yaml")
+        write_model(named_model(found.model, arm.name, files), folder / MODEL)
     (folder / "report.txt").write_text(text_of(report) + "\n", encoding="utf-8")
-    write_json(folder / "summary.json", summary)
+    write_json(folder / SUMMARY, summary)
     return report
 
 
 def _earlier_link(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     """Link statistics of the previous summary, for sessions finished there and here."""
     try:
-        earlier = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        earlier = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
         kept = {entry["name"] for entry in earlier["sessions"] if entry["exit_status"] == "success"}
         link = dict(earlier["link"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -354,9 +355,9 @@ def write_log_results(
         "versions": versions(),
         **estimated(found, model, sessions, tested),
     }
-    write_model(model, folder / "model.yaml")
+    write_model(model, folder / MODEL)
     (folder / "report.txt").write_text(text + "\n", encoding="utf-8")
-    write_json(folder / "summary.json", summary)
+    write_json(folder / SUMMARY, summary)
     from runner.report.page import write_report
 
     return write_report(folder)

@@ -23,6 +23,7 @@ import yaml
 from fri.errors import ConfigurationError
 from ident.excitation import ExcitationPlan, PlanProblem, assemble, random_points
 from lwr_driver.configuration import CONFIGS, find
+from runner.file_names import SUMMARY
 
 GROUPS = {
     "drive inertia": ("Ia",),
@@ -74,13 +75,13 @@ def experiment(folder: Path, name: str, plan: ExcitationPlan) -> list[dict[str, 
     file = folder / f"{name}.yaml"
     file.write_text(yaml.safe_dump(content), encoding="utf-8")
     out = folder / name
-    if not (out / "summary.json").is_file():
+    if not (out / SUMMARY).is_file():
         begun = (
             ["--resume", str(out)] if (out / "experiment.yaml").is_file() else [str(file), "--out", str(out)]
         )
         command = [sys.executable, "-m", "runner.cli", "experiment", *begun, "--yes", "--no-diagnosis"]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    summary = json.loads((out / SUMMARY).read_text(encoding="utf-8"))
     parameters: list[dict[str, Any]] = summary["parameters"]
     return parameters
 

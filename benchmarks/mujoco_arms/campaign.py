@@ -17,6 +17,7 @@ from joblib import Parallel, delayed
 from benchmarks.mujoco_arms.cases import ALL, draw, kind_of, make
 from benchmarks.mujoco_arms.judging import judge
 from benchmarks.mujoco_arms.tally import rho_of
+from runner.file_names import DIAGNOSIS
 
 _LONGEST_S = 3600.0
 # Behind the names of what is written of a diagnosis without healthy days.
@@ -77,8 +78,8 @@ def read_result(folder: Path, reference: bool = True) -> dict[str, Any]:
     """The verdict on the diagnosis of a case, judged anew."""
     result = {**_json(verdict_of(folder, reference)), "truth": _json(folder / "truth.json")}
     if "crash" not in result:
-        twin = diagnosis_of(folder / "twin", reference) / "diagnosis.json"
-        told = _json(diagnosis_of(folder, reference) / "diagnosis.json")
+        twin = diagnosis_of(folder / "twin", reference) / DIAGNOSIS
+        told = _json(diagnosis_of(folder, reference) / DIAGNOSIS)
         result["verdict"] = judge(told, result["truth"], _json(twin) if twin.is_file() else None)
     return result
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from runner.file_names import MODEL
 from runner.output import OUTPUT_FILE
 from runner.status import answer
 from runner.terminal import NAMED_FILE, PATH, FiniteRange, forced, json_option, to_json, verb
@@ -119,7 +120,7 @@ def compare_command(first: Path, second: Path, as_json: bool, level: float, repo
     from runner.ending import of_comparison
 
     labels = (f"{first}", f"{second}")
-    paths = [path / "model.yaml" if path.is_dir() else path for path in (first, second)]
+    paths = [path / MODEL if path.is_dir() else path for path in (first, second)]
     models = [read_model(path) for path in paths]
     result = compare(*models, level=level, labels=labels)
     page = None

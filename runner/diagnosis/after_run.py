@@ -27,19 +27,18 @@ from lwr_driver.configuration import find
 from lwr_driver.listing import Piece
 from lwr_driver.motion import Motion
 from lwr_driver.session import JointColumns, Phase, Session, read_session
-from runner.diagnosis.discriminating import Discriminating, offers, open_findings
-from runner.diagnosis.study import DIAGNOSIS, Study, study
+from runner.diagnosis.discriminating import PAUSE_NS, Discriminating, offers, open_findings
+from runner.diagnosis.study import Study, study
 from runner.experiment import Bench, ExperimentProgress, Record, Run
 from runner.experiment_file import Experiment, SessionPlan
+from runner.file_names import DECISION, DIAGNOSIS
 from runner.planning import Excitations, excitation_rows
 
 log = logging.getLogger(__name__)
 
 FOLDER = "diagnosis"
 DECIDING = "deciding"
-DECISION = "decision.json"
 BEFORE = "before_deciding.json"
-PAUSE_NS = 10_000_000_000
 
 Laboratory = Callable[[Experiment], AbstractContextManager[Bench]]
 

@@ -35,6 +35,9 @@ log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
 
+PAUSE_NS = 10_000_000_000
+"""Between the sessions before and a further one, whose clock may begin anew."""
+
 # Motions of the whole arm; the last two repeat the exciting motion.
 _AGAIN = (Kind.REPEATED_RUN, Kind.HOT_AND_COLD)
 _OF_THE_ARM = (Kind.STATIC_POSES, *_AGAIN)
@@ -46,7 +49,6 @@ _MOST = 3
 
 _PERIOD_S = 5e-3
 _ROW_S = 0.02
-_PAUSE_NS = 10_000_000_000
 _LEAST_NM = 1e-3
 
 
@@ -161,7 +163,7 @@ def foresee(
         last = max(int(session.joint.log_time[-1]) for session in sessions)
         further: list[Session] = []
         for payload in experiment.payloads:
-            start = last + _PAUSE_NS
+            start = last + PAUSE_NS
             further.append(made_up(diagnosis, diagnosis.base_model, experiment, payload, sessions, start))
             last = int(further[-1].joint.log_time[-1])
         try:

@@ -25,6 +25,7 @@ import numpy as np
 
 from fri.errors import ConfigurationError, DataError
 from ident.estimators.problem import TriangularFactor
+from runner.file_names import MODEL
 
 TABLES: Mapping[str, Sequence[tuple[str, str]]] = {
     "parameters": (("name", "string"), ("unit", "string"), ("value", "float64"), ("std", "float64")),
@@ -69,7 +70,7 @@ class ArmStore:
     @property
     def model(self) -> Path:
         """Model of the first day."""
-        return self.folder / "model.yaml"
+        return self.folder / MODEL
 
     @property
     def reference(self) -> Path:

@@ -16,6 +16,7 @@ from ident.diagnosis.statements import Number
 from ident.estimation.compare import Comparison, Difference
 from ident.model import DynamicModel
 from runner.computer import versions
+from runner.file_names import MODEL, SUMMARY
 from runner.report.figure import Figure
 from runner.report.folder import ResultFolder
 from runner.report.markup import Cell, figure_html, paragraph, section, table
@@ -46,7 +47,7 @@ class Side:
     @property
     def file(self) -> Path:
         """The model file."""
-        return self.place / "model.yaml" if self.place.is_dir() else self.place
+        return self.place / MODEL if self.place.is_dir() else self.place
 
 
 def short_names(first: Path, second: Path) -> tuple[str, str]:
@@ -54,7 +55,7 @@ def short_names(first: Path, second: Path) -> tuple[str, str]:
     parts = []
     for path in (Path(os.path.abspath(first)), Path(os.path.abspath(second))):
         own = path.parts
-        parts.append((*own[:-2], "/".join(own[-2:])) if path.name == "model.yaml" and len(own) > 2 else own)
+        parts.append((*own[:-2], "/".join(own[-2:])) if path.name == MODEL and len(own) > 2 else own)
     for count in range(1, max(map(len, parts)) + 1):
         ends = [Path(*own[-count:]).as_posix() for own in parts]
         if ends[0] != ends[1]:
@@ -80,7 +81,7 @@ def comparison_html(comparison: Comparison, joints: Sequence[str], sides: tuple[
         )
     first, second = sides
     content = section("differences", "Differences", _figure(comparison, joints), _table(comparison, sides))
-    runs = [side for side in sides if (side.place / "summary.json").is_file()]
+    runs = [side for side in sides if (side.place / SUMMARY).is_file()]
     if runs:
         content += section("errors", "Torque errors of the runs", *_errors(runs))
     only = [

@@ -22,6 +22,7 @@ from runner.diagnosis.records import (
     Residuals,
     read_look_alikes,
 )
+from runner.file_names import DECISION, DETAILS, DIAGNOSIS
 from runner.report.diagnosis_figures import (
     finding_figure,
     look_alike_figure,
@@ -52,14 +53,14 @@ class DiagnosisFolder:
     def load(cls, path: str | Path) -> DiagnosisFolder:
         """Of a folder by `lwr-run diagnose`. Raises ConfigurationError for another one, DataError for a broken one."""
         folder = Path(path)
-        file = folder / "diagnosis.json"
+        file = folder / DIAGNOSIS
         if not file.is_file():
             raise ConfigurationError(
                 f"{folder}: holds no diagnosis.json; name the folder of `lwr-run diagnose --out`"
             )
         try:
             content = json.loads(file.read_text(encoding="utf-8"))
-            found = cls(folder, content, tuple(_json(folder / "details.json").get("joints", ())))
+            found = cls(folder, content, tuple(_json(folder / DETAILS).get("joints", ())))
         except (OSError, ValueError) as error:
             raise DataError(f"{file}: cannot be read: {error}; run `lwr-run diagnose` again") from error
         return found
@@ -80,13 +81,13 @@ class DiagnosisFolder:
     @cached_property
     def statements(self) -> Statements:
         """The diagnosis in words."""
-        answers = _json(self.path / "decision.json").get("answers", [])
+        answers = _json(self.path / DECISION).get("answers", [])
         return statements(self.content, self.details, self.joint_names, answers)
 
     @cached_property
     def details(self) -> Mapping[str, Any]:
         """Content of details.json."""
-        return _json(self.path / "details.json")
+        return _json(self.path / DETAILS)
 
     @cached_property
     def residuals(self) -> Residuals | None:

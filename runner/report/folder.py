@@ -23,6 +23,7 @@ from ident.rows.filters import ParallelFilter, SignalSettings
 from ident.rows.prepared import Passage
 from lwr_driver.session import Session, read_session
 from lwr_driver.session.spool import spans, stored, stored_together
+from runner.file_names import DIAGNOSIS, MODEL, SUMMARY
 from runner.published import is_published_arm
 
 Floats = NDArray[np.float64]
@@ -187,7 +188,7 @@ class ResultFolder:
     def load(cls, path: str | Path) -> ResultFolder:
         """Read `summary.json` of a folder. ConfigurationError if there is none, DataError if it is broken."""
         folder = Path(path)
-        file = folder / "summary.json"
+        file = folder / SUMMARY
         if not file.is_file():
             raise ConfigurationError(
                 f"{folder}: holds no summary.json; name the folder of an experiment, the last line of the output of "
@@ -206,7 +207,7 @@ class ResultFolder:
     @cached_property
     def model(self) -> DynamicModel | None:
         """The identified model, or None."""
-        file = self.path / "model.yaml"
+        file = self.path / MODEL
         return read_model(file) if file.is_file() else None
 
     @cached_property
@@ -237,12 +238,12 @@ class ResultFolder:
     def diagnosis_folder(self) -> Path:
         """Folder of the diagnosis files: `diagnosis`, or the folder itself."""
         own = self.path / "diagnosis"
-        return own if (own / "diagnosis.json").is_file() else self.path
+        return own if (own / DIAGNOSIS).is_file() else self.path
 
     @cached_property
     def diagnosis(self) -> Mapping[str, Any] | None:
         """Content of diagnosis.json, or None. DataError if it is broken."""
-        file = self.diagnosis_folder / "diagnosis.json"
+        file = self.diagnosis_folder / DIAGNOSIS
         if not file.is_file():
             return None
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fri.errors import ConfigurationError
+from runner.file_names import DIAGNOSIS, SUMMARY
 from runner.report.diagnosis import DiagnosisFolder, diagnosis_paper_figures
 from runner.report.figure import Figure, MatrixFigure
 from runner.report.figures import every_figure
@@ -36,7 +37,7 @@ def save_for_paper(
         raise ConfigurationError(f"figures: {place} is a file; name a folder")
     figures: list[Figure | MatrixFigure] = []
     results, diagnosis = None, None
-    if (source / "summary.json").is_file() or not (source / "diagnosis.json").is_file():
+    if (source / SUMMARY).is_file() or not (source / DIAGNOSIS).is_file():
         results = ResultFolder.load(source)
         figures += every_figure(results, joints=joints)
         diagnosis = DiagnosisFolder.of(results)
