@@ -30,7 +30,7 @@ from scipy.ndimage import maximum_filter1d
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis import SimulationError
 from ident.model import DynamicModel
-from ident.rows.filters import low_pass
+from ident.rows.filters import low_pass, median_step
 from ident.rows.sessions import payload_name
 from lwr_driver.configuration import parse
 from lwr_driver.session import Session
@@ -416,7 +416,7 @@ def _smooth(times: NDArray[np.int64], position: Floats, grid: NDArray[np.int64])
     first, last = np.searchsorted(times, grid[[0, -1]] + np.array([-_AROUND_NS, _AROUND_NS]))
     times, position = times[first:last], position[first:last]
     here = (times - times[0]) * 1e-9
-    step = float(np.median(np.diff(here)))
+    step = median_step(here)
     even = np.arange(0.0, here[-1], step)
     values = np.column_stack([np.interp(even, here, column) for column in position.T])
     values = low_pass(values, step, min(_PATH_HZ, 0.2 / step))

@@ -12,6 +12,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from ident.diagnosis.nominal import SideRows
 from ident.diagnosis.recording import SessionRecord
 from ident.estimators.covariance import correlation_time
+from ident.rows.filters import median_step
 
 Floats = NDArray[np.float64]
 
@@ -35,7 +36,7 @@ def noise_floor(
         if len(first) < 50 or len(second) < 0.6 * len(first):
             continue
         at = rows.time[second] - length
-        step = float(np.median(np.diff(rows.time[first])))
+        step = median_step(rows.time[first])
         # Rows need not be evenly spaced: a slow tick seldom fits the cycle.
         after = np.clip(np.searchsorted(rows.time[first], at), 1, len(first) - 1)
         earlier = at - rows.time[first[after - 1]] < rows.time[first[after]] - at
@@ -46,7 +47,7 @@ def noise_floor(
         return *misfit(rows, residual), False
     sigma, inflation = np.ones(n), np.ones(n)
     differences = np.concatenate(pairs)
-    dt = max(float(np.median(np.diff(rows.time))), 1e-6)
+    dt = max(median_step(rows.time), 1e-6)
     for j in range(n):
         d = differences[:, j]
         d = d[np.isfinite(d)]

@@ -24,6 +24,7 @@ from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import NAMELESS, Column
 from ident.effects.motion import ArmMotion
 from ident.effects.nameless import KNOTS, hats
+from ident.rows.filters import median_step
 
 # Lowest frequency distinguishable from a drift in a session [Hz].
 _LOWEST_HZ = 0.3
@@ -123,7 +124,7 @@ def _not_repeating(
     if mine.sum() < 200:
         return None
     time = rows.time[mine] - recording.start_s
-    step = float(np.median(np.diff(rows.time[rows.session == session])))
+    step = median_step(rows.time[rows.session == session])
     place = np.round((time - time[0]) / step).astype(np.int64)
     even, known = np.zeros(place[-1] + 1), np.zeros(place[-1] + 1, dtype=bool)
     even[place], known[place] = residual[mine], True

@@ -23,10 +23,9 @@ from ident.dynamics import regressor
 from ident.dynamics.parameters import PER_LINK, Floats, joint_unit
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular, rows_of
-from ident.estimation.scores import resampled
 from ident.estimation.validate import mounted, prepared_session
 from ident.model.dynamic_model import DynamicModel
-from ident.rows.filters import SignalSettings
+from ident.rows.filters import SignalSettings, resampled
 from ident.rows.prepared import PreparedSession
 from lwr_driver.listing import Listing, Piece, text_of
 from lwr_driver.session import Session

@@ -26,7 +26,7 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
-from ident.rows.filters import ParallelFilter, SignalSettings
+from ident.rows.filters import ParallelFilter, SignalSettings, median_step, resampled
 from ident.rows.prepared import Passage, PreparedSession, TorqueChannel
 from ident.rows.sessions import payload_name
 from lwr_driver.listing import Piece, in_units, text_of
@@ -380,15 +380,10 @@ def _residuals(passage: Passage, predict: Predictor, side: Side, settings: Signa
     return _Rows(channel.times, error, torque, used, moving, band, valid, passage.index)
 
 
-def resampled(times: Floats, values: Floats, wanted: Floats) -> Floats:
-    """Columns of `values` at the times `wanted`, by linear interpolation."""
-    return np.column_stack([np.interp(wanted, times, column) for column in values.T])
-
-
 def inside(channel: TorqueChannel, passage: Passage) -> NDArray[np.bool_]:
     """Samples in the part of the passage with rows."""
     rows = passage.stretch_rows if len(passage.stretch_rows) else passage.rows
-    step = float(np.median(np.diff(rows))) if len(rows) > 1 else 1.0
+    step = median_step(rows) if len(rows) > 1 else 1.0
     nearest = np.clip(np.searchsorted(rows, channel.times), 0, len(rows) - 1)
     before = np.maximum(nearest - 1, 0)
     distance = np.minimum(np.abs(rows[nearest] - channel.times), np.abs(rows[before] - channel.times))

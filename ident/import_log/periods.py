@@ -25,6 +25,7 @@ from fri.errors import DataError
 from ident.import_log.mapping import PeriodMarks
 from ident.import_log.tables import Floats
 from ident.rows.binned import bins
+from ident.rows.filters import median_step
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -88,7 +89,7 @@ def marked_periods(marks: PeriodMarks, time: Floats, position: Floats) -> Period
     if marks.count == 0:
         return None
     # The last sample of a period is a step before the next one begins.
-    step = float(np.median(np.diff(time)))
+    step = median_step(time)
     length = float(time[-1] - time[0]) + step - marks.start_s
     period = marks.period_s if marks.period_s is not None else length / (marks.count or 1)
     fit = int((length + 0.5 * step) / period) if period > 0.0 else 0
@@ -136,7 +137,7 @@ class _Motion:
         q, noise = position[:, moving], noise[moving]
         if not q.shape[1] or np.any(noise > _LOUDEST * q.std(axis=0)):
             return None
-        step = float(np.median(np.diff(seconds)))
+        step = median_step(seconds)
         grid_s = max(_GRID_S, step, seconds[-1] / _MOST_GRID)
         grid = np.arange(seconds[0], seconds[-1] + 1e-9, grid_s)
         from scipy.interpolate import CubicSpline  # on use: its import is slow

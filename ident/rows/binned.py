@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Coulomb, DriveMotion, ModelStructure, Side
+from ident.rows.filters import median_step, resampled
 from ident.rows.prepared import PreparedSession, TorqueChannel
 
 _CHUNK = 500
@@ -141,12 +142,10 @@ def observe_bins(
             some = channel.at(inside)
             if len(some.times) < 2:
                 continue
-            width = max(1, round(bin_s / float(np.median(np.diff(some.times)))))
+            width = max(1, round(bin_s / median_step(some.times)))
             torque = some.torque
             if side == "difference":
-                torque = torque - np.column_stack(
-                    [np.interp(some.times, passage.joint.times, column) for column in passage.joint.torque.T]
-                )
+                torque = torque - resampled(passage.joint.times, passage.joint.torque, some.times)
             found.append(
                 BinnedRows(
                     side,

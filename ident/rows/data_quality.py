@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from ident.rows.content import Kept
+from ident.rows.filters import median_step
 from lwr_driver.session import JointColumns, Session
 from lwr_driver.session.spool import column, spans
 
@@ -277,7 +278,7 @@ def jumps(times: Floats, position: Floats) -> tuple[Jump, ...]:
     """`position_jumps` of positions (N, J) [rad or m] at times (N,) [s]."""
     if len(times) < 2 * _AROUND + 2:
         return ()
-    period = max(float(np.median(np.diff(times))), 1e-9)
+    period = max(median_step(times), 1e-9)
     found = []
     for joint in range(position.shape[1]):
         values = column(position, joint)

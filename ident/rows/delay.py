@@ -36,7 +36,7 @@ from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.least_squares import WeightedLeastSquares, weighted_solution
 from ident.estimators.problem import Problem, RowGroup
 from ident.rows.content import Kept
-from ident.rows.filters import ParallelFilter, half_width, interpolate_uniform, low_pass
+from ident.rows.filters import ParallelFilter, half_width, interpolate_uniform, low_pass, median_step
 from lwr_driver.session.spool import Growing, release
 
 logger = logging.getLogger(__name__)
@@ -380,7 +380,7 @@ def _shown(problem: Problem) -> list[int]:
 
 
 def _unknown(stretches: Sequence[DelayData], why: str) -> Delay:
-    period = max((float(np.median(np.diff(data.motor_times))) for data in stretches), default=0.0)
+    period = max((median_step(data.motor_times) for data in stretches), default=0.0)
     return Delay(0.0, period, why)
 
 
@@ -443,7 +443,7 @@ class _Rows:
             return None
         low, high = np.searchsorted(data.motor_times, [first, last]).tolist()
         outputs = np.arange(first + 0.5 * width, last - 0.5 * width, 1.0 / (2.5 * cutoff_hz))
-        step = float(np.median(np.diff(data.motor_times[low:high:every])))
+        step = median_step(data.motor_times[low:high:every])
         found, states = [], Growing()
         for block in blocks:
             rows = outputs[(outputs >= block.core[0]) & (outputs < block.core[1])]

@@ -282,6 +282,11 @@ def median_step(times: Floats) -> float:
     return float(np.median(np.diff(times))) if len(times) > 1 else float("nan")
 
 
+def resampled(times: Floats, values: Floats, wanted: Floats) -> Floats:
+    """Columns of `values` at the times `wanted`, by linear interpolation."""
+    return np.column_stack([np.interp(wanted, times, column) for column in values.T])
+
+
 def block_means(values: NDArray[np.generic], factor: int) -> Floats:
     """Means (m // factor, ...) of `factor` neighbours in (m, ...); a remainder at the end is left out."""
     count = len(values) // factor

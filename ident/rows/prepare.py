@@ -44,6 +44,7 @@ from ident.rows.filters import (
     advice,
     block_means,
     enough,
+    median_step,
     moving,
     thinning,
 )
@@ -173,7 +174,7 @@ def prepare(
         settings,
         excitation_hz=excitation,
         joint_rate_hz=1.0 / dt,
-        motor_rate_hz=None if motor_data is None else 1.0 / float(np.median(np.diff(motor_data[0]))),
+        motor_rate_hz=None if motor_data is None else 1.0 / median_step(motor_data[0]),
         resonance_hz=resonance_hz,
     )
     warnings += advised if advise else ()
@@ -394,7 +395,7 @@ def _delay(
         )
         for m in motions
     ]  # fmt: skip
-    rate = 1.0 / float(np.median(np.diff(times)))
+    rate = 1.0 / median_step(times)
     return estimate_delay(
         data,
         names,

@@ -51,7 +51,7 @@ from ident.rows.class_rows import (
 from ident.rows.content import Kept, Recall
 from ident.rows.data_quality import passed_band
 from ident.rows.delay import DELAY_HZ
-from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass
+from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass, median_step
 from ident.rows.prepare import prepare
 from ident.rows.reversals import TURNING_RAD
 from lwr_driver.session import Session
@@ -329,7 +329,7 @@ class _Bench:
         """Rows (m, k) with a low-pass common to torque and columns where an earlier one smoothed the torques."""
         if self.band is None or len(rows.time) < 2:
             return values
-        dt = float(np.median(np.diff(rows.time)))
+        dt = median_step(rows.time)
         if 0.5 * self.band * dt >= 0.4:
             return values
         return low_pass(values, dt, 0.5 * self.band)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ident.dynamics.parameters import Floats
 from ident.rows.data_quality import position_jumps
+from ident.rows.filters import median_step
 from ident.screening.doubts import LATE_S, MEND_TIME, MOVED, Doubt
 from lwr_driver.session import JointColumns, Session
 
@@ -98,7 +99,7 @@ def _speeds(joint: JointColumns) -> tuple[Floats, Floats, Floats] | None:
         return None
     clock = joint.publish_time if np.ptp(joint.publish_time) > 0 else joint.log_time
     time = (clock - clock[0]) * 1e-9
-    size = max(_BLOCK, int(np.ceil(_BLOCK_S / max(float(np.median(np.diff(time))), 1e-9))))
+    size = max(_BLOCK, int(np.ceil(_BLOCK_S / max(median_step(time), 1e-9))))
     places = np.arange(0, len(time) - 1, size)
     if len(places) < 20:
         return None

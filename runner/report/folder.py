@@ -19,7 +19,7 @@ from ident.estimation.scores import Predictor, Score, SessionScore, score_sessio
 from ident.estimation.validate import mounted, predictor, prepared_session, signals_for
 from ident.model import DynamicModel
 from ident.model.model_file import read_model
-from ident.rows.filters import ParallelFilter, SignalSettings
+from ident.rows.filters import ParallelFilter, SignalSettings, median_step
 from ident.rows.prepared import Passage
 from lwr_driver.session import Session, read_session
 from lwr_driver.session.spool import spans, stored, stored_together
@@ -140,7 +140,7 @@ def _part(passage: Passage, side: Side, predict: Predictor, cutoff_hz: float) ->
     first = begin if passage.continues else passage.rows[0]
     last = end if end < np.inf else passage.rows[-1]
     inside = (channel.times >= first) & (channel.times <= last) & passage.own(channel.times)
-    step = float(np.median(np.diff(channel.times)))
+    step = median_step(channel.times)
     cutoff = min(cutoff_hz, 0.2 / step)
     grid = np.arange(first, last, 1.0 / (_RATE_PER_CUTOFF * cutoff))
     low_pass = ParallelFilter(channel.times, grid, cutoff, _ATTENUATION_DB)
