@@ -13,7 +13,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.trust.stand import Clock, TimedTurnaround, shared_ring
+from benchmarks.trust.stand import TimedTurnaround, shared_ring
 from benchmarks.trust.table import Ledger, Line, stamp
 from fri.controller_end import ControllerEnd
 from fri.in_process import Network
@@ -29,6 +29,7 @@ from runner.planning import Excitations
 from runner.preflight import load_data
 from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import LoadData, load_configuration
+from tests.lwr_driver.driver_rig import Clock
 
 __all__ = ["LEAST_NM", "PROMISED", "Bench", "Run", "campaign", "healthy", "push"]
 

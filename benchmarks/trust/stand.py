@@ -40,6 +40,7 @@ from runner.planning import dwell
 from sim_backend.faults import FaultyWire, Parcel, WireFault
 from sim_backend.monitor import CommandMonitor
 from sim_backend.program import krl_program
+from tests.lwr_driver.driver_rig import Clock
 
 __all__ = ["LABEL", "START", "Stand", "the_arm", "the_motion"]
 
@@ -79,25 +80,6 @@ def the_motion(period_ms: int, variant: int) -> Motion:
     motion = parts[0].join(rest).join(parts[1]).join(parts[2])
     check_motion(arm, motion)
     return motion
-
-
-class Clock:
-    """Time that only the stand lets pass; stands in for the module `time` of the loop."""
-
-    def __init__(self) -> None:
-        self.now_ns = 10**12
-
-    def monotonic(self) -> float:
-        """Virtual time [s]."""
-        return self.now_ns * 1e-9
-
-    def monotonic_ns(self) -> int:
-        """Virtual time [ns]."""
-        return self.now_ns
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass."""
-        self.now_ns += round(seconds * 1e9)
 
 
 class TimedTurnaround(Turnaround):

@@ -211,3 +211,27 @@ class Rig:
     def target(self) -> NDArray[np.float64]:
         """Last position that was sent."""
         return np.array(self.loop.remote.command["jnt_pos"], dtype=np.float64)
+
+
+def check_sent(rig: Rig) -> None:
+    """What arrived at the controller is within the arm's limits."""
+    assert rig.arrived.excesses(arm().limits, rig.period_s) == []
+
+
+class Clock:
+    """Time that only its owner lets pass; stands in for the module `time` of the loop."""
+
+    def __init__(self) -> None:
+        self.now_ns = 10**12
+
+    def monotonic(self) -> float:
+        """Virtual time [s]."""
+        return self.now_ns * 1e-9
+
+    def monotonic_ns(self) -> int:
+        """Virtual time [ns]."""
+        return self.now_ns
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        self.now_ns += round(seconds * 1e9)

@@ -14,7 +14,7 @@ from lwr_driver.control import BIN_NS, Job, Mode, Result, Text, Word
 from lwr_driver.loop import Loop
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.ring import NO_PHASE, ROW, Ring
-from tests.lwr_driver.driver_rig import START, Rig, arm
+from tests.lwr_driver.driver_rig import START, Rig, arm, check_sent
 
 HOP = np.array([0.4, -0.3, 0.3, 0.5, -0.6, 0.2, 0.7])
 
@@ -44,10 +44,6 @@ def in_motion(rig: Rig, cycles: int) -> Motion:
     rig.cycles(cycles)
     assert rig.mode is Mode.MOTION
     return motion
-
-
-def check_sent(rig: Rig) -> None:
-    assert rig.arrived.excesses(arm().limits, rig.period_s) == []
 
 
 def test_outside_command_mode_the_controllers_set_point_is_mirrored(rig):

@@ -10,7 +10,8 @@ import pytest
 from fri.states import Quality, State
 from lwr_driver.control import Result, Text
 from lwr_driver.pace import Pace, Stamps
-from tests.lwr_driver.test_loop import HOP, Rig, check_sent, in_motion
+from tests.lwr_driver.driver_rig import Clock, Rig, check_sent
+from tests.lwr_driver.test_loop import HOP, in_motion
 
 PERIOD_S = 0.005
 MS = 1_000_000
@@ -97,17 +98,6 @@ def test_stamps_too_coarse_for_a_cycle_say_nothing():
     for number in range(5):
         stamps.feed(1, start + number * PERIOD_S, PERIOD_S)
     assert stamps.feed(6, start + 5 * PERIOD_S, PERIOD_S) == 6
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now_ns = 10**12
-
-    def monotonic(self) -> float:
-        return self.now_ns * 1e-9
-
-    def monotonic_ns(self) -> int:
-        return self.now_ns
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ from lwr_driver.motion import Motion, move_to
 from lwr_driver.session import read_session
 from lwr_driver.session.motor_torque import KrlMotorTorque
 from lwr_driver.session.writer import session_metadata
+from runner.laboratory import free_port
 from sim_backend.process import EmulatorProcess
 from tests.lwr_driver.driver_rig import arm
 
@@ -47,7 +47,7 @@ def lab(laboratories):
 class Lab:
     def __init__(self) -> None:
         self.spoiled = False
-        self.emulator = EmulatorProcess(lock_step=True, fri_port=_free_port())
+        self.emulator = EmulatorProcess(lock_step=True, fri_port=free_port("127.0.0.1"))
         self.emulator.start()
         self.driver = Driver(arm(), _settings(self.emulator.fri_port), motor_torque=KrlMotorTorque())
         self.driver.connect()
@@ -96,12 +96,6 @@ class Lab:
         monitor = self.emulator.status()["monitor"]
         assert monitor["commands"] > 0
         assert monitor["violations"] == 0, monitor["first_violation"]
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _settings(port: int, **more: object) -> LinkSettings:

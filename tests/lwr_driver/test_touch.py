@@ -12,7 +12,7 @@ from lwr_driver.control import Mode, Result, Text, Word
 from lwr_driver.loop import _UNACCEPTABLE_PACKETS
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.ring import Ring
-from tests.lwr_driver.driver_rig import Rig, arm
+from tests.lwr_driver.driver_rig import Rig, arm, check_sent
 from tests.lwr_driver.driver_twins import Watched
 
 HOP = np.array([0.4, -0.3, 0.3, 0.5, -0.6, 0.2, 0.7])
@@ -74,10 +74,6 @@ def in_motion(r: Rig, cycles: int = 60) -> Motion:
     r.cycles(cycles)
     assert r.mode is Mode.MOTION
     return motion
-
-
-def check_sent(r: Rig) -> None:
-    assert r.arrived.excesses(arm().limits, r.period_s) == []
 
 
 def refused(r: Rig, result: Result = Result.ROBOT) -> str:

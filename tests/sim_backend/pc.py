@@ -1,7 +1,6 @@
 """A PC's end of the link for the tests of the emulator: follows a trajectory whenever it may command."""
 
 import contextlib
-import socket
 import threading
 
 import numpy as np
@@ -14,13 +13,6 @@ from sim_backend.pendant import Pendant
 from sim_backend.service import Service
 
 QUICK = {"controller.settle_s": 0.2}
-
-
-def free_port():
-    """A UDP port on 127.0.0.1 that nobody uses at the moment."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Pc:

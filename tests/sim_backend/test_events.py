@@ -10,9 +10,10 @@ import time
 
 import pytest
 
+from runner.laboratory import free_port
 from sim_backend.configuration import load_configuration
 from sim_backend.service import Service
-from tests.sim_backend.pc import QUICK, Pc, emulator, free_port, gentle
+from tests.sim_backend.pc import QUICK, Pc, emulator, gentle
 
 
 def until(done: object, seconds: float = 20.0) -> None:
@@ -24,7 +25,7 @@ def until(done: object, seconds: float = 20.0) -> None:
 
 
 def test_modes_and_the_reason_of_a_drop_are_told(caplog: pytest.LogCaptureFixture) -> None:
-    port = free_port()
+    port = free_port("127.0.0.1")
     with caplog.at_level(logging.DEBUG, logger="emulator"), Pc(port, gentle) as pc, emulator(port) as pendant:
         pc.run(500)
         pendant.emergency_stop()
@@ -44,7 +45,7 @@ def test_modes_and_the_reason_of_a_drop_are_told(caplog: pytest.LogCaptureFixtur
 
 
 def test_without_v_only_what_must_be_seen_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    port = free_port()
+    port = free_port("127.0.0.1")
     with caplog.at_level(logging.WARNING, logger="emulator"), Pc(port, gentle) as pc, emulator(port):
         pc.run(300)
     assert [record for record in caplog.records if record.name == "emulator"] == []
@@ -53,7 +54,7 @@ def test_without_v_only_what_must_be_seen_is_told(caplog: pytest.LogCaptureFixtu
 def test_in_lock_step_a_client_that_left_is_told_and_the_next_one_is_served(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    port = free_port()
+    port = free_port("127.0.0.1")
     # In command mode too: the closed port ends the wait at once.
     with caplog.at_level(logging.WARNING, logger="emulator"), emulator(port) as pendant:
         with Pc(port, gentle) as pc:
@@ -68,7 +69,7 @@ def test_in_lock_step_a_client_that_left_is_told_and_the_next_one_is_served(
 
 
 def test_gravity_compensation_from_the_pendant_lets_a_push_move_the_arm() -> None:
-    port = free_port()
+    port = free_port("127.0.0.1")
     with Pc(port) as pc, emulator(port, {"fri.program": "lwr_identification"}) as pendant:
         pc.run(100)
         pendant.gravity_compensation()
@@ -87,7 +88,7 @@ def test_gravity_compensation_from_the_pendant_lets_a_push_move_the_arm() -> Non
 
 
 def test_with_once_the_emulator_ends_with_its_client(caplog: pytest.LogCaptureFixture) -> None:
-    port = free_port()
+    port = free_port("127.0.0.1")
     config = load_configuration("emulator/default.yaml", {**QUICK, "fri.period_ms": 2})
     service = Service(config, ("127.0.0.1", port), once=True)
     thread = threading.Thread(target=service.run, args=(True,))
@@ -107,7 +108,7 @@ def test_with_once_the_emulator_ends_with_its_client(caplog: pytest.LogCaptureFi
 
 @pytest.mark.slow
 def test_the_command_shows_events_and_ends_with_its_client() -> None:
-    port = free_port()
+    port = free_port("127.0.0.1")
     command = [
         sys.executable,
         "-m",
@@ -140,7 +141,7 @@ def test_a_wrong_program_is_one_message_of_the_command() -> None:
         "--program",
         "nothing",
         "--fri-port",
-        str(free_port()),
+        str(free_port("127.0.0.1")),
     ]
     found = subprocess.run(command, capture_output=True, text=True)
     assert found.returncode == 2

@@ -6,12 +6,13 @@ import pytest
 from fri.errors import RobotError
 from fri.packets import MSR
 from fri.states import State
-from tests.sim_backend.pc import Pc, emulator, free_port, gentle
+from runner.laboratory import free_port
+from tests.sim_backend.pc import Pc, emulator, gentle
 
 
 def session(seed, cycles=1500, settings=None, period_ms=2, restart=True):
     """(packets received, status at the end) of a run with the gentle motion."""
-    port = free_port()
+    port = free_port("127.0.0.1")
     with (
         Pc(port, gentle, restart) as pc,
         emulator(port, seed=seed, period_ms=period_ms, settings=settings or {}) as pendant,
@@ -124,7 +125,7 @@ def test_every_interruption_ends_command_mode_and_the_arm(command, arguments, po
 
 
 def test_silence_shows_as_a_gap_and_a_restart_as_new_counters():
-    port = free_port()
+    port = free_port("127.0.0.1")
     with Pc(port) as pc, emulator(port) as pendant:
         pc.run(300)
         pendant.silence(50)
@@ -139,7 +140,7 @@ def test_silence_shows_as_a_gap_and_a_restart_as_new_counters():
 
 
 def test_virtual_time_stands_still_while_the_pc_does_not_read():
-    port = free_port()
+    port = free_port("127.0.0.1")
     with Pc(port) as pc, emulator(port) as pendant:
         pc.run(100)
         before = pendant.status()["time_s"]
@@ -149,7 +150,7 @@ def test_virtual_time_stands_still_while_the_pc_does_not_read():
 
 
 def test_operator_at_the_pendant():
-    port = free_port()
+    port = free_port("127.0.0.1")
     with Pc(port) as pc, emulator(port) as pendant:
         pc.run(200)
         empty = np.array(pendant.status()["joint_torque"])
@@ -188,7 +189,7 @@ def test_operator_at_the_pendant():
 
 
 def test_trace_file_over_the_pendant_agrees_with_the_packets(tmp_path):
-    port = free_port()
+    port = free_port("127.0.0.1")
     with Pc(port, gentle) as pc, emulator(port) as pendant:
         pc.run(250)
         pendant.start_trace()
@@ -204,7 +205,7 @@ def test_trace_file_over_the_pendant_agrees_with_the_packets(tmp_path):
 
 
 def test_program_can_be_stopped_and_started_with_another_period():
-    port = free_port()
+    port = free_port("127.0.0.1")
     with Pc(port) as pc, emulator(port) as pendant:
         pc.run(100)
         pendant.stop_program()
@@ -218,7 +219,7 @@ def test_program_can_be_stopped_and_started_with_another_period():
 
 
 def test_real_time_keeps_its_period_and_answers_arrive_in_it():
-    port = free_port()
+    port = free_port("127.0.0.1")
     with Pc(port) as pc, emulator(port, lock_step=False, period_ms=10) as pendant:
         assert pc.run(60, silence_s=2.0) == 60
         status = pendant.status()
@@ -261,7 +262,7 @@ class Stuck:
 
 
 def test_other_physics_can_take_the_place_of_the_arm():
-    port = free_port()
+    port = free_port("127.0.0.1")
     plant = {"type": "tests.sim_backend.test_link:Stuck", "options": {"offset": 4.0}}
     with Pc(port) as pc, emulator(port, settings={"robot.plant": plant}) as pendant:
         pc.run(100)
@@ -269,7 +270,7 @@ def test_other_physics_can_take_the_place_of_the_arm():
 
 
 def test_a_pc_that_stops_answering_in_command_mode_is_dropped():
-    port = free_port()
+    port = free_port("127.0.0.1")
     with Pc(port, gentle) as pc, emulator(port, settings={"fri.patience_s": 0.02}) as pendant:
         pc.run(500)
         assert pendant.status()["state"] == "CMD"
@@ -285,7 +286,7 @@ def test_a_pc_that_stops_answering_in_command_mode_is_dropped():
     ("name", "power"), [("cold_start", 0), ("poor_link", 0x7F), ("late_motor_torque", 0x7F)]
 )
 def test_shipped_scenarios_run(name, power):
-    port = free_port()
+    port = free_port("127.0.0.1")
     with Pc(port, gentle) as pc, emulator(port, config=f"emulator/{name}.yaml") as pendant:
         assert pc.run(900) == 900
         status = pendant.status()

@@ -9,8 +9,9 @@ import sys
 import pytest
 
 from fri.errors import ConfigurationError, NetworkError
+from runner.laboratory import free_port
 from sim_backend import Emulator
-from tests.sim_backend.pc import QUICK, Pc, free_port, gentle
+from tests.sim_backend.pc import QUICK, Pc, gentle
 
 
 def emulator(port, **options):
@@ -21,7 +22,7 @@ def emulator(port, **options):
 def test_two_processes_with_one_seed_send_the_same_bytes():
     runs = []
     for _ in range(2):
-        port = free_port()
+        port = free_port("127.0.0.1")
         with Pc(port, gentle) as pc, emulator(port, seed=7, period_ms=2) as machine:
             pc.run(800)
             status = machine.status()
@@ -31,7 +32,7 @@ def test_two_processes_with_one_seed_send_the_same_bytes():
 
 
 def test_it_ends_with_its_block_and_the_pendant_says_so():
-    with emulator(free_port()) as machine:
+    with emulator(free_port("127.0.0.1")) as machine:
         pid = machine.pid
         pendant = machine.pendant
         assert pid is not None
@@ -44,7 +45,7 @@ def test_it_ends_with_its_block_and_the_pendant_says_so():
 
 
 def test_shutdown_over_the_pendant_ends_it():
-    with emulator(free_port()) as machine:
+    with emulator(free_port("127.0.0.1")) as machine:
         machine.pendant.shutdown()
         assert machine.wait() == 0
 
@@ -52,7 +53,7 @@ def test_shutdown_over_the_pendant_ends_it():
 def test_it_dies_with_a_parent_that_was_killed():
     script = (
         "from sim_backend import Emulator; import sys, time\n"
-        f"machine = Emulator(fri_port={free_port()}, settings={QUICK!r}); machine.start()\n"
+        f"machine = Emulator(fri_port={free_port('127.0.0.1')}, settings={QUICK!r}); machine.start()\n"
         "print(machine.pid, flush=True); time.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
@@ -77,7 +78,7 @@ def test_it_dies_with_a_parent_that_was_killed():
 )
 def test_wrong_configuration_is_reported_by_the_parent(settings, message):
     with pytest.raises(ConfigurationError, match=message):
-        Emulator(fri_port=free_port(), settings=settings).start()
+        Emulator(fri_port=free_port("127.0.0.1"), settings=settings).start()
 
 
 @pytest.mark.parametrize(
@@ -107,7 +108,7 @@ def test_the_emulator_describes_itself_in_at_most_ten_lines():
     assert lines[-1] == "  and 16 more settings"
     assert len(lines) <= 10
     assert machine.address == ("127.0.0.1", 49951)
-    with emulator(free_port()) as running:
+    with emulator(free_port("127.0.0.1")) as running:
         assert f"running (process {running.pid})" in repr(running)
         assert str(running.pendant_port) in repr(running)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,10 +14,7 @@ from ident.diagnosis.products import Rows
 from ident.diagnosis.signatures import signature_bench
 from ident.dynamics.kinematics import Chain
 from ident.effects import find_effect
-from lwr_driver.session import Session
-
-Make = Callable[..., Session]
-Signals = dict[str, np.ndarray]
+from tests.ident.diagnosis.changes import Make, Signals, pair, stribeck
 
 
 def odd_hose(s: Signals) -> None:
@@ -29,14 +25,9 @@ def odd_hose(s: Signals) -> None:
     s["joint"][:, 2] += pull
 
 
-def stribeck(s: Signals) -> None:
-    v = s["qd"][:, 1]
-    s["motor"][:, 1] += 0.3 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
-
-
 @pytest.mark.slow
 def test_what_a_hose_of_another_form_leaves_is_no_second_cause(make: Make, chain: Chain) -> None:
-    found = diagnose([make("a.mcap", 1, odd_hose), make("b.mcap", 2, odd_hose, 1)], chain)
+    found = diagnose(pair(make, odd_hose), chain)
     assert {(f.cause, f.joints) for f in found.claims} == {("cable_spring", (3,))}
     assert found.claims[0].confidence > 0.8
     assert 3 in {u.joint for u in found.unexplained}
@@ -53,7 +44,7 @@ def test_what_the_least_error_of_a_strong_law_explains_is_no_second_cause(
             0.035 * np.sin(4.0 * s["q"][:, joint - 1]) * np.sign(s["qd"][:, joint - 1])
         )
 
-    found = diagnose([make("a.mcap", 1, both), make("b.mcap", 2, both, 1)], chain)
+    found = diagnose(pair(make, both), chain)
     assert {j for f in found.claims for j in f.joints} == named
     assert len(found.claims) == len(named)
     assert max(found.claims, key=lambda f: f.gain).cause == "stribeck"
@@ -74,7 +65,7 @@ def test_a_turn_about_the_vertical_is_nothing_beyond_its_law(make: Make, chain: 
 def test_a_cause_is_claimed_only_where_a_motion_that_was_not_fitted_shows_it_too(
     make: Make, chain: Chain
 ) -> None:
-    train = [make("a.mcap", 1, stribeck), make("b.mcap", 2, stribeck, 1)]
+    train = pair(make, stribeck)
     same = diagnose(train, chain, test=[make("c.mcap", 3, stribeck, 2)])
     assert [(f.cause, f.joints) for f in same.claims] == [("stribeck", (2,))]
     gone = diagnose(train, chain, test=[make("c.mcap", 3, None, 2)])

@@ -20,14 +20,7 @@ from ident.model.model_file import model_text, read_model
 from ident.rows.data_quality import clipped_at, stuck_at
 from ident.rows.data_quality import stale as old
 from lwr_driver.session import Session
-
-Make = Callable[..., Session]
-Signals = dict[str, np.ndarray]
-
-
-def stribeck(s: Signals) -> None:
-    v = s["qd"][:, 1]
-    s["motor"][:, 1] += 0.3 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
+from tests.ident.diagnosis.changes import Make, Signals, pair, stribeck
 
 
 def load_friction(s: Signals) -> None:
@@ -72,10 +65,6 @@ def clipped(s: Signals) -> None:
 def late_motor(s: Signals) -> None:
     old = s["time"] - 0.006
     s["motor"][:] = np.column_stack([np.interp(old, s["time"], c) for c in s["motor"].T])
-
-
-def pair(make: Make, change: Callable[[Signals], None] | None = None, seed: int = 1) -> list[Session]:
-    return [make("a.mcap", seed, change), make("b.mcap", seed + 1, change, 1)]
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,7 @@ from ident.diagnosis.day_spread import habit
 from ident.diagnosis.reference import INERTIA_BY_PHASE
 from ident.dynamics.kinematics import Chain
 from lwr_driver.session import Session
-
-Make = Callable[..., Session]
-Signals = dict[str, np.ndarray]
+from tests.ident.diagnosis.changes import Make, Signals, pair
 
 
 def friction(share: float, joint: int = 1) -> Callable[[Signals], None]:
@@ -27,10 +25,6 @@ def friction(share: float, joint: int = 1) -> Callable[[Signals], None]:
         s["motor"][:, joint] += share * (0.6 * np.sign(v) + 0.8 * v)
 
     return change
-
-
-def pair(make: Make, change: Callable[[Signals], None] | None = None, seed: int = 1) -> list[Session]:
-    return [make("a.mcap", seed, change), make("b.mcap", seed + 1, change, 1)]
 
 
 @pytest.fixture(scope="module")

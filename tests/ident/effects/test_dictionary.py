@@ -11,6 +11,7 @@ from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, ArmMotion, Setting, Shape, check_entry, find_effect
 from ident.effects.load import leaning, slide
 from ident.effects.motion import dahl
+from tests.ident.effects.swing import swing
 
 TABLE = {
     "motor": {
@@ -50,34 +51,8 @@ CONTACT = {"time": 0.5, "duration": 0.5, "session": 1.0, "link": 3.0}
 
 @pytest.fixture(scope="module")
 def motion(chain: Chain, bodies: np.ndarray) -> ArmMotion:
-    time = np.arange(0.0, 4.0, 0.002)
-    w = 2.0 * np.pi / 2.0 * np.array([1.0, 1.5, 2.0])
-    phase = np.array([0.3, 1.0, 2.0])
-    q = 0.6 * np.sin(w * time[:, None] + phase)
-    qd = 0.6 * w * np.cos(w * time[:, None] + phase)
-    qdd = -0.6 * w**2 * np.sin(w * time[:, None] + phase)
-    from ident.dynamics.regressor import torque
-
-    joint = torque(chain, q, qd, qdd, bodies)
-    return ArmMotion(
-        chain=chain,
-        bodies=bodies,
-        session=0,
-        time=time,
-        duration_s=4.0,
-        q=q,
-        qd=qd,
-        qdd=qdd,
-        motor_speed=qd,
-        motor_acceleration=qdd,
-        joint_torque=joint,
-        motor_torque=joint + 2.0 * qd + 1.5 * np.sign(qd),
-        gear_ratio=np.full(3, 100.0),
-        inertia=np.full(3, 0.4),
-        link_coulomb=np.zeros(3),
-        motor_coulomb=np.full(3, 1.5),
-        friction=lambda v: 2.0 * v + 1.5 * np.sign(v),
-    )
+    w, phase = np.pi * np.array([1.0, 1.5, 2.0]), np.array([0.3, 1.0, 2.0])
+    return swing(chain, bodies, w, phase, 0.002, inertia=0.4, session=0)
 
 
 def setting() -> Setting:

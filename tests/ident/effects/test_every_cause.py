@@ -29,11 +29,11 @@ from ident.effects import (
     find_effect,
     parameter_values,
 )
+from tests.ident.effects.swing import COULOMB, VISCOUS, swing
 
 URDF = Path(__file__).parents[3] / "configs" / "lwr4plus.urdf"
 NAMES = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")
 JOINT, DT = 3, 1e-3
-VISCOUS, COULOMB = 2.0, 1.5
 
 # A count and a phase of a session log have the names of causes.
 WORDS_OF_LOGS = ("lost_samples", "contact")
@@ -58,40 +58,12 @@ FORMS = [
 def motion() -> ArmMotion:
     """All joints of the LWR4+ in motion, with drives of viscous and Coulomb friction and no inertia."""
     chain = Chain.from_urdf(str(URDF))
-    time = np.arange(0.0, 4.0, DT)
-    w = np.pi * np.array([0.5, 0.8, 1.0, 0.6, 1.2, 0.9, 1.1])
-    phase = np.linspace(0.2, 2.0, 7)
-    q = 0.6 * np.sin(w * time[:, None] + phase)
-    qd = 0.6 * w * np.cos(w * time[:, None] + phase)
-    qdd = -0.6 * w**2 * np.sin(w * time[:, None] + phase)
+    w, phase = np.pi * np.array([0.5, 0.8, 1.0, 0.6, 1.2, 0.9, 1.1]), np.linspace(0.2, 2.0, 7)
     bodies = np.zeros((7, 10))
     bodies[:, [0, 3, 5]] = 0.05
     bodies[:, 6:9] = np.array([0.02, 0.1, 0.05])
     bodies[:, 9] = 2.0
-    joint = regressor.torque(chain, q, qd, qdd, bodies)
-
-    def friction(speed: np.ndarray) -> np.ndarray:
-        return VISCOUS * speed + COULOMB * np.sign(speed)
-
-    return ArmMotion(
-        chain=chain,
-        bodies=bodies,
-        session=1,
-        time=time,
-        duration_s=4.0,
-        q=q,
-        qd=qd,
-        qdd=qdd,
-        motor_speed=qd,
-        motor_acceleration=qdd,
-        joint_torque=joint,
-        motor_torque=joint + friction(qd),
-        gear_ratio=np.full(7, 100.0),
-        inertia=np.zeros(7),
-        link_coulomb=np.zeros(7),
-        motor_coulomb=np.full(7, COULOMB),
-        friction=friction,
-    )
+    return swing(chain, bodies, w, phase, DT, inertia=0.0, session=1)
 
 
 def setting(motion: ArmMotion, encoder: str | None = None) -> Setting:
