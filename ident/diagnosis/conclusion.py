@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.diagnosis.bench import DiagnosisBench
@@ -264,7 +265,7 @@ def _shipped(
     return extended, before, left, errors, harmful
 
 
-def _states(nominal: Nominal, side: str, block: Floats) -> RowStates:
+def _states(nominal: Nominal, side: str, block: NDArray[np.int64]) -> RowStates:
     rows, motions = nominal.rows[side], nominal.motions
     signals = ([m.q for m in motions], [m.motor_speed for m in motions], [m.joint_torque for m in motions])
     return RowStates(rows.time, rows.session, block, *(nominal.reduce(side, parts) for parts in signals))

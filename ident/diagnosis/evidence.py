@@ -410,9 +410,9 @@ class Evidence:
 
     # ---- results of a fit ----
 
-    def block_of(self, side: str) -> Floats:
+    def block_of(self, side: str) -> NDArray[np.int64]:
         """Number (m,) of the block of each row of a side, -1 for held-out rows."""
-        return self._block[side].astype(float)
+        return self._block[side]
 
     def residuals(self, *, test: bool = False) -> dict[str, Floats]:
         """Residual (m, n) by side with the present columns, NaN in unused rows; `test` : of held-out rows instead."""

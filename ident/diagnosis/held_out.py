@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # the words about a diagnosis need a constant of this module, and no search
     from ident.diagnosis.evidence import Evidence
@@ -28,7 +29,7 @@ class HeldOut:
     """Residual (m, n) [Nm] by side on held-out rows, NaN elsewhere, and the blocks (m,) of rows."""
 
     residual: dict[str, Floats]
-    block: dict[str, Floats]
+    block: dict[str, NDArray[np.int64]]
 
     def where(self, other: HeldOut) -> HeldOut:
         """The same on the rows of `other`: a shift in time changes the usable rows of a channel."""
@@ -59,14 +60,14 @@ def held_out(evidence: Evidence, extra: Sequence[Rows]) -> HeldOut:
     return HeldOut(evidence.held_residuals(), {side: evidence.block_of(side) for side in rows})
 
 
-def _blocks_of(rows: Mapping[str, SideRows], block_s: float) -> dict[str, Floats]:
+def _blocks_of(rows: Mapping[str, SideRows], block_s: float) -> dict[str, NDArray[np.int64]]:
     """Number (m,) by side of each row's block of `block_s` of its session, the same on all sides."""
     pairs = [
         np.stack([r.session, np.floor(r.time / block_s).astype(np.int64)], axis=1) for r in rows.values()
     ]
     number = np.unique(np.concatenate(pairs), axis=0, return_inverse=True)[1].ravel()
     ends = np.cumsum([len(pair) for pair in pairs])
-    return dict(zip(rows, np.split(number.astype(float), ends[:-1]), strict=True))
+    return dict(zip(rows, np.split(number, ends[:-1]), strict=True))
 
 
 def interval(
@@ -133,14 +134,14 @@ def worse_rows(
 
 def _by_block(before: HeldOut, after: HeldOut, weights: Mapping[Key, float]) -> Floats:
     """Weighted sums of squares before and after, and number of rows, (blocks, 3)."""
-    blocks: dict[float, Floats] = {}
+    blocks: dict[int, Floats] = {}
     for (side, joint), weight in weights.items():
         a, b = before.residual[side][:, joint], after.residual[side][:, joint]
         ok = np.isfinite(a) & np.isfinite(b)
         for block in np.unique(before.block[side][ok]):
             mine = ok & (before.block[side] == block)
             part = np.array([weight * np.sum(a[mine] ** 2), weight * np.sum(b[mine] ** 2), mine.sum()])
-            blocks[float(block)] = blocks.get(float(block), np.zeros(3)) + part
+            blocks[int(block)] = blocks.get(int(block), np.zeros(3)) + part
     return np.array(list(blocks.values()))
 
 

@@ -58,8 +58,8 @@ class Reference:
     model : its identified model. compliance : (n,) [rad/Nm]. motor_delay_s, joint_delay_s : of its channels.
     noise : of a row [Nm] by side, (n,). correlated : number of rows that count as one for it, by side, (n,).
     null : mean gain of each candidate by (cause, joint from 0). sets : number of healthy sets of sessions behind the
-    null. encoder : `link` or `motor`, see `nominal.Arm`.
-    presliding : (n,) presliding length [rad], None if unknown. far, far_share : (n,) see `nominal.Arm`.
+    null. encoder : `link` or `motor`, see `nominal_arm.NominalArm`.
+    presliding : (n,) presliding length [rad], None if unknown. far, far_share : (n,) see `nominal_arm.NominalArm`.
     delay_std_s : of the channels' delays from day to day, by side. habits : whether the covariance of the model holds
     the changes from day to day. masses : announced, of its payloads [kg].
     gain_std : of the torque sensors' gains from day to day. compliance_std : (n,) [rad/Nm] standard error of the

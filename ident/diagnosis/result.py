@@ -177,7 +177,7 @@ class RowStates:
 
     time: Floats
     session: NDArray[np.int64]
-    block: Floats
+    block: NDArray[np.int64]
     position: Floats
     speed: Floats
     load: Floats

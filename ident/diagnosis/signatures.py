@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.diagnosis.bench import ArmData, DiagnosisBench, nominal_arm, prepare_bench
@@ -48,7 +49,7 @@ class Signature:
     parameters: Mapping[str, float]
     form: Form | None
     time: Mapping[str, Floats]
-    session: Mapping[str, Floats]
+    session: Mapping[str, NDArray[np.int64]]
     torque: Mapping[str, Floats]
     left: Mapping[str, Floats]
     strength: float
@@ -148,7 +149,7 @@ def _signature(
         {**linear, **shape},
         shape.form,
         {side: side_rows.time for side, side_rows in bench.nominal.rows.items()},
-        {side: side_rows.session.astype(float) for side, side_rows in bench.nominal.rows.items()},
+        {side: side_rows.session for side, side_rows in bench.nominal.rows.items()},
         torque,
         left,
         float(size),

@@ -33,11 +33,10 @@ from runner.diagnosis.records import (
     write_look_alikes,
 )
 from runner.estimation import couplings
+from runner.file_names import DETAILS, DIAGNOSIS
 from runner.replay import Replay
 from runner.terminal import write_json
 
-DIAGNOSIS = "diagnosis.json"
-DETAILS = "details.json"
 EXTENDED = "model_extended.yaml"
 TEXT = "diagnosis.txt"
 

@@ -20,13 +20,11 @@ DOTTED = re.compile(r"`([a-z_]\w*(?:\.[A-Za-z_]\w*)+)`")
 SUFFIXES = ("html", "json", "jsonl", "md", "py", "yaml")
 # Sections of a file, called like a module beside the docstring that tells of them.
 KEYS = ("robot.gravity", "robot.payload")
-# To be named `nominal_arm.NominalArm`.
-MOVED = ("nominal.Arm",)
 
 
 def meant(module: str, name: str) -> str | None:
     """Full name of something in this project, None for one of elsewhere: a file, a key of one, another package."""
-    if name.rpartition(".")[2] in SUFFIXES or name in KEYS or name in MOVED:
+    if name.rpartition(".")[2] in SUFFIXES or name in KEYS:
         return None
     first = name.partition(".")[0]
     room = module if FILES[module].name == "__init__.py" else module.rpartition(".")[0]

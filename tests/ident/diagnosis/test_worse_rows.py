@@ -15,7 +15,7 @@ def errors(scale: float, *, one_block: bool = False) -> HeldOut:
     rng = np.random.default_rng(5)
     residual, block = rng.standard_normal((ROWS, 2)), np.arange(ROWS) // (ROWS // BLOCKS)
     residual[:, 1] *= np.where((block == 0) | (not one_block), scale, 1.0)
-    return HeldOut({"motor": residual}, {"motor": block.astype(float)})
+    return HeldOut({"motor": residual}, {"motor": block})
 
 
 @pytest.mark.parametrize(
