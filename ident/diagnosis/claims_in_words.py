@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ SURE = 0.8
 WIDTH = 100
 """Characters of a line."""
 
+_SESSION = re.compile(r"\bsession ([1-9]\d*)\b")
 _SEEN = {
     "motor": "Seen in the motor torque only.",
     "joint": "Acts on the links.",
@@ -93,9 +95,10 @@ def finding_statement(
     both: bool = False,
     compared: bool = False,
     told_apart: bool = False,
+    sessions: Sequence[str] = (),
 ) -> FindingStatement:
     """A finding in words. both : whether the sessions have both torques. compared : with a healthy arm. told_apart :
-    from all its alternatives by the motion of these sessions."""
+    from all its alternatives by the motion of these sessions. sessions : names, by their numbers."""
     cause, mode, side = str(finding["cause"]), finding.get("mode"), str(finding.get("side", ""))
     detail = finding.get("detail")
     meaning = ""
@@ -105,6 +108,9 @@ def finding_statement(
         meaning = f"{summary_of(cause)}: {described(cause, values_of(finding), finding.get('form'), names)}"
         meaning += f", {mode} sessions." if mode else "."
         meaning = meaning.replace(MODELS, "the healthy arm's") if compared else meaning
+        meaning = _SESSION.sub(
+            lambda found: sessions[int(found[1]) - 1] if int(found[1]) <= len(sessions) else found[0], meaning
+        )
     seen = _SEEN_BY_BOTH if both and side == "joint" else _SEEN.get(side, "")
     confidence, others = finding.get("confidence"), finding.get("alternatives") or []
     doubt = ""

@@ -119,6 +119,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         findings=tuple(f for f in findings if not is_character(f)),
         character=tuple(f for f in findings if is_character(f)),
         referenced=task.reference is not None,
+        numbered=tuple(r.name for r in nominal.recordings),
         healthy=() if task.reference is None else tuple(task.reference.model.effects),
         healthy_left={} if task.reference is None else task.reference.left,
         doubted=tuple(doubts),

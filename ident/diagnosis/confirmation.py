@@ -36,6 +36,9 @@ _REPLACEABLE = 0.8
 # Largest gain of another function of the variable beside a law that is exact, as a share of its own. One bent cause is
 # ten times as likely as a scale and a second cause with this variable on the same torque; a bend this small is as rare.
 _BENT = 0.05
+# The same beside any other law: a wave of the angle is no spring, though a cubic one takes most of it. Hoses and
+# friction of other forms than ours left 0.01 at most, other causes told by the name of a law 0.4 and more.
+_OTHER = 0.25
 # Standard deviations by which the delay in slow rows contradicts that in the others.
 _CONTRADICTED = 3.0
 # Least power of a cause in the held-out rows for a test there, over that in the rows fitted.
@@ -100,7 +103,7 @@ def doubted(
         )
         # No held-out session confirms a change between sessions, and a dependence on the motion is similar to one.
         like = claim.trial.passing and bool(unnamed & mine)
-        strange = not claim.trial.candidate.effect.known_of_drives(claim.trial.shape)
+        strange = not _familiar(claim, bench)
         open_ = like or strange or grounds.replaceable > _REPLACEABLE or _bent(claim, remainders)
         most = min(one.most, claim.confidence, _OPEN if open_ else 1.0)
         findings.append(
@@ -109,10 +112,17 @@ def doubted(
     return findings
 
 
+def _familiar(claim: Claim, bench: DiagnosisBench) -> bool:
+    """Whether arms are known with the torque of a claim."""
+    trial, setting = claim.trial, bench.dictionary.setting
+    joint = max(trial.candidate.joint, 0)
+    return trial.candidate.effect.familiar(trial.shape, claim.score.coefficients, setting, joint)
+
+
 def _bent(claim: Claim, remainders: Sequence[Remainder]) -> bool:
-    """Whether another function of its variable is left in the rows of a claim whose law is exact."""
+    """Whether another function of its variable is left in the rows of a claim, more than its law may be wrong by."""
     law = claim.trial.candidate.effect.law
-    if law is None or not law.exact:
+    if law is None:
         return False
     variable = f"{law.variable}{claim.trial.candidate.joint + 1}"
     left = [
@@ -121,7 +131,7 @@ def _bent(claim: Claim, remainders: Sequence[Remainder]) -> bool:
         if (r.side, r.joint - 1) in claim.trial.rows
         and any(term.form.split(" ")[0] == variable for term in r.terms)
     ]
-    return sum(left) > _BENT * claim.gain
+    return sum(left) > (_BENT if law.exact else _OTHER) * claim.gain
 
 
 def contradicted(finding: Finding) -> Finding:

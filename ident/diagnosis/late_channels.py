@@ -27,6 +27,8 @@ _SHIFTS = 5
 _UNIT_S = 1e-3
 # Least number of joints for a delay to be confirmed by more than one.
 _MOST_ALONE = 3
+# Lead of a torque over the positions that elastic joints and late stamps may give it [s].
+_EARLIEST_S = 5e-3
 # Largest remaining delay after a shift, as a share of the tolerance for delays.
 _IN_PLACE = 0.2
 
@@ -39,7 +41,8 @@ def in_time(task: Task, state: State) -> State:
         c.trial.candidate.cause
         for c in late
         if not (
-            _late_at_all_speeds(c, *slow[c.trial.candidate.cause])
+            _possible(task, c)
+            and _late_at_all_speeds(c, *slow[c.trial.candidate.cause])
             and (_told_apart(task, c) is not None or _late_in_all_joints(state.bench, c))
         )
     ]
@@ -207,6 +210,13 @@ def _elsewhere(task: Task, bench: DiagnosisBench, claim: Claim) -> tuple[float, 
         return told
     bench.evidence.replace([])
     return slow_delay(bench, claim.trial)
+
+
+def _possible(task: Task, claim: Claim) -> bool:
+    """Whether a channel comes no earlier than the positions: no torque is there before it acts, but play lets a motor
+    turn back before its link."""
+    known = task.arm.motor_delay_s if _channel(claim) == "motor" else task.arm.joint_delay_s
+    return known + _made(claim) > -_EARLIEST_S
 
 
 def _late_at_all_speeds(claim: Claim, slow: float, std: float) -> bool:

@@ -197,7 +197,8 @@ class Diagnosis(Tabular):
     healthy_left : the same of the base model on the healthy arm of the reference, empty if unknown.
     torque_base, torque_extended : errors of the models in the test sessions with all samples, None without any.
     torque_present : the same of the present model, None without one.
-    referenced : against a healthy arm. notes : sentences on limits of the data. data : broken channels, left out.
+    referenced : against a healthy arm. numbered : names of all sessions, in the order of their numbers.
+    notes : sentences on limits of the data. data : broken channels, left out.
     residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN in unused rows.
     states : of the arm in these rows, by side.
     """
@@ -225,6 +226,7 @@ class Diagnosis(Tabular):
     residuals: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict, repr=False)
     states: Mapping[str, RowStates] = field(default_factory=dict, repr=False)
     referenced: bool = False
+    numbered: tuple[str, ...] = ()
     data: tuple[BrokenChannel, ...] = ()
     healthy: tuple[Mapping[str, Any], ...] = ()
     healthy_left: Mapping[str, Floats] = field(default_factory=dict)
@@ -338,6 +340,7 @@ class Diagnosis(Tabular):
     def details(self) -> dict[str, Any]:
         """Content of `details.json` about the verdict: errors of each joint, parameters moved, limits of the data."""
         return {
+            "sessions": list(self.numbered),
             "joints": list(self.base_model.structure.chain.joint_names),
             "reference": self.referenced,
             "sure": SURE,

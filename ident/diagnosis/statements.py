@@ -161,7 +161,14 @@ def statements(
     compared = bool(details.get("reference"))
     said = [
         finding_statement(
-            number, one, names, sure, both=both, compared=compared, told_apart=number in told_apart
+            number,
+            one,
+            names,
+            sure,
+            both=both,
+            compared=compared,
+            told_apart=number in told_apart,
+            sessions=details.get("sessions") or (),
         )
         for number, one in enumerate(claims, start=1)
     ]
@@ -350,7 +357,9 @@ def _lines(
         worse = _worse(details, names)
         text += f"; worse: {', '.join(worse)}" if worse else ""
         if findings and content.get("extension") == []:
-            text = "the same as the base model, for no cause here lasts and lessens the error of held-out sessions"
+            text = (
+                "the base model: no cause here is a term that lasts and lessens the error of further sessions"
+            )
             found.append(Line("extended model", text, "", "good", "gain"))
         else:
             found.append(

@@ -388,8 +388,8 @@ class Effect(ABC):
         """Whether the coefficients lie in their physically sensible ranges."""
         return all(p.low <= value <= p.high for p, value in zip(self.linear, coefficients, strict=False))
 
-    def known_of_drives(self, shape: Shape) -> bool:
-        """Whether drives are known with such a shape; another one fits a torque of another cause."""
+    def familiar(self, shape: Shape, coefficients: Floats, setting: Setting, joint: int) -> bool:
+        """Whether arms are known with such a torque; another one of the same law is often of another cause."""
         return True
 
     def seen_in_samples(self, shape: Shape) -> bool:

@@ -77,7 +77,7 @@ class PreslidingHysteresis(Effect):
         lengths = [Shape(length=x) for x in (5e-4, 1.5e-3, 5e-3, 1.5e-2, 5e-2, 0.15) if x >= least]
         return [*lengths, *(Shape(_Turning.SMOOTH, velocity=v) for v in (0.01, 0.025, 0.06))]
 
-    def known_of_drives(self, shape: Shape) -> bool:
+    def familiar(self, shape: Shape, coefficients: Floats, setting: Setting, joint: int) -> bool:
         """Whether it turns over a tenth of a radian at most: what lasts longer is a memory of the speed."""
         return shape.get("length", 0.0) <= _LONGEST
 

@@ -269,6 +269,10 @@ _RATIOS = (-1.8, -0.7, 0.7, 1.8)
 _RUB_RAD = 0.1
 
 
+# Slope of a spring against its pull, over the steepest one, that passes for none.
+_FLAT = 0.1
+
+
 class CableSpring(Effect):
     """Hoses and cables pull with `stiffness f(q)`.
 
@@ -334,6 +338,15 @@ class CableSpring(Effect):
         if shape.form is _Spring.HARDENING:
             return bool(coefficients[0] + coefficients[2] >= 0.0)
         return bool(coefficients[0] >= 0.0)
+
+    def familiar(self, shape: Shape, coefficients: Floats, setting: Setting, joint: int) -> bool:
+        """Whether it pulls the more, the further the joint turns: a wave of the angle does not."""
+        if shape.form is not _Spring.HARDENING:
+            return True
+        low, high = setting.position_range[joint]
+        pull = np.polynomial.Polynomial([0.0, *coefficients])
+        slopes = pull.deriv()(np.linspace(low, high, 50))
+        return bool(slopes.min() >= -_FLAT * slopes.max())
 
     def simpler(self, shape: Shape) -> Shape | None:
         """A hardening spring that does not harden is a linear one."""

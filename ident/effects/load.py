@@ -237,8 +237,8 @@ def leaning(motion: ArmMotion) -> Floats:
 _COURSE = 0.1
 
 
-# Push beyond what the torque sensors of any such arm can read.
-_STRONGEST_N = 1000.0
+# Push beyond which it is a collision, and stops such an arm.
+_STRONGEST_N = 400.0
 
 
 class Contact(Effect):
@@ -275,6 +275,10 @@ class Contact(Effect):
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """None: times and durations come from the residual's bursts."""
         return []
+
+    def plausible(self, coefficients: Floats, shape: Shape) -> bool:
+        """Whether the whole force is one that an arm withstands: along its links it hardly turns a joint."""
+        return float(np.linalg.norm(coefficients)) <= _STRONGEST_N
 
     def law_std(self, parameters: Parameters, form: Form | None) -> Parameters:
         """Middle and duration, known to a part of the duration: a real push is no half sine."""

@@ -91,7 +91,6 @@ class Study:
         """Plain content of details.json: everything beside diagnosis.json."""
         return {
             "schema_version": 1,
-            "sessions": list(self.sessions),
             **self.diagnosis.details,
             "sure": self.sure,
             "notes": list(self.notes),

@@ -164,3 +164,32 @@ def test_a_reference_with_the_friction_of_its_drives_at_the_links_is_made_anew(
     model = DynamicModel("arm", base.structure, base.names, values, None, base, reference.stored())
     with pytest.raises(ConfigurationError, match="commission the arm again"):
         Reference.of(model)
+
+
+def test_torques_well_before_the_positions_are_no_late_channel(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def before(s: Signals) -> None:
+        turned()(s)
+        for torque in s["motor"].T:
+            torque[:] = np.interp(s["time"] + 0.02, s["time"], torque)
+
+    made = [make("a.mcap", 71, before), make("b.mcap", 72, before, 1)]
+    bare = [replace(s, joint=replace(s.joint, effort=s.joint.effort[:, :0])) for s in made]
+    assert all(one.side != "timing" for one in diagnose(bare, chain, reference=reference).findings)
+
+
+@pytest.mark.parametrize("cycles", [1.0, 1.5, 2.0])
+def test_a_wave_of_the_angle_is_no_sure_spring(
+    make: Make, chain: Chain, reference: Reference, cycles: float
+) -> None:
+    def waved(s: Signals) -> None:
+        turned()(s)
+        s["motor"][:, 0] += 3.0 * np.sin(cycles * s["q"][:, 0] + 0.7)
+
+    made = [make("a.mcap", 81, waved), make("b.mcap", 82, waved, 1)]
+    bare = [replace(s, joint=replace(s.joint, effort=s.joint.effort[:, :0])) for s in made]
+    found = diagnose(bare, chain, reference=reference)
+    (spring,) = [one for one in found.findings if one.cause == "cable_spring"]
+    assert spring.confidence <= 0.7
+    assert {term.joint for term in found.nameless} == {1}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -116,9 +117,22 @@ def test_a_saturating_constant_reads_the_more_too_much_the_larger_the_torque() -
 
 
 def test_friction_that_turns_over_twenty_degrees_is_no_presliding_of_a_drive() -> None:
-    known = EFFECTS["presliding_hysteresis"].known_of_drives
-    assert known(Shape(length=0.02))
-    assert not known(Shape(length=0.37))
+    effect, one = EFFECTS["presliding_hysteresis"], np.ones(1)
+    assert effect.familiar(Shape(length=0.02), one, None, 0)  # type: ignore[arg-type]
+    assert not effect.familiar(Shape(length=0.37), one, None, 0)  # type: ignore[arg-type]
+
+
+def test_a_hose_pulls_the_more_the_further_the_joint_turns() -> None:
+    spring = EFFECTS["cable_spring"]
+    hardening = spring.shape_of({"stiffness": 1.0, "quadratic": 0.0, "cubic": 1.0}, "hardening")
+    travel = SimpleNamespace(position_range=np.array([[-2.0, 2.0]]))
+    for coefficients, known in (
+        ([1.1, 0.05, -0.02], True),
+        ([1.0, 0.0, 0.3], True),
+        ([3.7, -1.0, -1.2], False),
+        ([-1.0, 0.0, 0.3], False),
+    ):
+        assert spring.familiar(hardening, np.array(coefficients), travel, 0) == known  # type: ignore[arg-type]
 
 
 def test_smooth_friction_is_none_at_standstill_and_whole_at_speed() -> None:

@@ -155,7 +155,7 @@ def test_an_extended_model_without_the_causes_and_rows_that_it_worsens_are_named
     line = next(one for one in said.lines if one.subject == "extended model")
     assert (
         line.found
-        == "the same as the base model, for no cause here lasts and lessens the error of held-out sessions"
+        == "the base model: no cause here is a term that lasts and lessens the error of further sessions"
     )
     assert (line.wanted, line.level) == ("", "good")
 
@@ -224,3 +224,25 @@ def test_a_cause_on_the_links_is_in_the_torques_that_there_are() -> None:
         (finding,) = statements(content, details(), NAMES).findings
         assert "Acts on the links" in finding.text
         assert ("both torques see it" in finding.text) == both
+
+
+def test_a_moment_is_told_with_the_name_of_its_session() -> None:
+    contact = FINDING | {
+        "cause": "contact",
+        "joints": [],
+        "side": "joint",
+        "parameters": {
+            name: {"value": value, "std": 0.1, "unit": unit}
+            for name, value, unit in (
+                ("force_x", 20.0, "N"),
+                ("force_y", 0.0, "N"),
+                ("force_z", 0.0, "N"),
+                ("time", 4.0, "s"),
+                ("duration", 1.0, "s"),
+                ("session", 2.0, "1"),
+                ("link", 7.0, "1"),
+            )
+        },
+    }
+    said = statements(CONTENT | {"findings": [contact]}, details(sessions=["late.mcap", "early.mcap"]), NAMES)
+    assert "of early.mcap" in said.text()
