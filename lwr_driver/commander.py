@@ -24,7 +24,7 @@ HOLD, BRAKE, CONTACT, RETREAT = 0, 1, 2, 3
 """Phase numbers given by the loop itself: holding; stopping before the end of a motion, or at a contact; going back."""
 
 # A retreat ends where the arm was commanded so long before the contact was noticed.
-_BEFORE_CONTACT_S = 0.05
+BEFORE_CONTACT_S = 0.05
 # An arm at rest is pressed by more than this share of the limit of the external torque.
 _PRESSED = 0.5
 
@@ -314,7 +314,7 @@ class Commander:
         if self.mode not in (Mode.HOLD, Mode.MOTION, Mode.STOP):
             return
         reason = f"{what} {self.place()}; {advice}"
-        moving, before = self.mode is Mode.MOTION, round(_BEFORE_CONTACT_S / self._period)
+        moving, before = self.mode is Mode.MOTION, round(BEFORE_CONTACT_S / self._period)
         if moving:
             origin = self._plan[max(self.index - before, 0)].copy()
             self.stop(Result.ROBOT, reason)

@@ -30,6 +30,7 @@ limits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
@@ -321,20 +322,9 @@ def stop_extent(limits: ArmLimits, period_s: float, q: Rows) -> tuple[Rows, Rows
     Returns three (n, 7): lowest position [rad], highest position [rad], highest speed [rad/s]. The positions
     are bounds, too wide by about one period at the highest speed at most.
     """
-    padded = np.vstack([q[:1], q[:1], q])
-    v = (padded[2:] - padded[1:-1]) / period_s
-    a = (padded[2:] - 2.0 * padded[1:-1] + padded[:-2]) / period_s**2
-    a_max, j_max = limits.a_max, limits.j_max
-    a = _let_go(limits, period_s, v, a)
-    # Mirror each case so that the velocity is positive after a is brought to zero at full jerk. Then the stop
-    # has three phases: jerk downwards, acceleration at -peak, jerk back to zero.
-    sign = np.where(v + a * np.abs(a) / (2.0 * j_max) >= 0.0, 1.0, -1.0)
-    v, a = sign * v, sign * a
-    peak = np.minimum(np.sqrt(np.maximum(j_max * v + 0.5 * a**2, 0.0)), np.maximum(a_max, -a))
-    t1, t3 = (a + peak) / j_max, peak / j_max
-    v1 = v + a * t1 - 0.5 * j_max * t1**2
-    v2 = 0.5 * peak**2 / j_max
-    t2 = np.where(peak > 0.0, np.maximum(v1 - v2, 0.0) / np.where(peak > 0.0, peak, 1.0), 0.0)
+    braking, j_max = _Braking.of(limits, period_s, q, np.arange(len(q))), limits.j_max
+    sign, v, a, peak = braking.sign, braking.v, braking.a, braking.peak
+    t1, t2, t3, v1, v2 = braking.t1, braking.t2, braking.t3, braking.v1, braking.v2
     x1 = v * t1 + 0.5 * a * t1**2 - j_max * t1**3 / 6.0
     x2 = x1 + v1 * t2 - 0.5 * peak * t2**2
     end = x2 + v2 * t3 - 0.5 * peak * t3**2 + j_max * t3**3 / 6.0
@@ -349,6 +339,77 @@ def stop_extent(limits: ArmLimits, period_s: float, q: Rows) -> tuple[Rows, Rows
     lowest = q + np.where(sign > 0.0, below, -above)
     highest = q + np.where(sign > 0.0, above, -below)
     return lowest, highest, np.maximum(np.abs(v), peak_speed)
+
+
+def stop_paths(limits: ArmLimits, period_s: float, q: Rows, rows: NDArray[np.intp], every: int = 1) -> Rows:
+    """The rows that `Stop` commands when it begins at `rows` (m,) of q, all at once.
+
+    q : (n, 7) [rad]; rows before the first equal the first. every : only each so many rows of a stop
+
+    Returns (m, k, 7) [rad]: entry 0 is the row of q itself, the last one is at rest.
+    """
+    braking = _Braking.of(limits, period_s, q, rows)
+    cycles = int(np.ceil(np.max(braking.duration, initial=0.0) / period_s - 1e-9))
+    cycles = every * math.ceil(cycles / every)
+    times = np.asarray(period_s * np.arange(1, cycles + 1), dtype=np.float64)
+    way = period_s * np.cumsum(braking.velocity(times), axis=1)
+    start = q[rows][:, np.newaxis].astype(np.float64)
+    return np.concatenate([start, start + way[:, every - 1 :: every]], axis=1)
+
+
+@dataclass(frozen=True)
+class _Braking:
+    """Shortest stops in closed form, of every joint by itself; arrays (n, 7), and limits of jerk j_max (7,).
+
+    Each is mirrored by its sign so that the velocity is positive after a is brought to zero at full jerk. Then the
+    stop has three phases, t1, t2, t3 [s] long: jerk downwards, acceleration at -peak, jerk back to zero. v1 and v2 are
+    the velocities at their borders.
+    """
+
+    sign: Rows
+    v: Rows
+    a: Rows
+    peak: Rows
+    t1: Rows
+    t2: Rows
+    t3: Rows
+    v1: Rows
+    v2: Rows
+    j_max: Rows
+
+    @classmethod
+    def of(cls, limits: ArmLimits, period_s: float, q: Rows, rows: NDArray[np.intp]) -> _Braking:
+        """Stops begun at `rows` of q (n, 7) [rad]; rows before the first equal the first."""
+        q0, q1, q2 = (q[np.maximum(rows - back, 0)] for back in range(3))
+        v = (q0 - q1) / period_s
+        a = (q0 - 2.0 * q1 + q2) / period_s**2
+        a_max, j_max = limits.a_max, limits.j_max
+        a = _let_go(limits, period_s, v, a)
+        sign = np.where(v + a * np.abs(a) / (2.0 * j_max) >= 0.0, 1.0, -1.0)
+        v, a = sign * v, sign * a
+        peak = np.minimum(np.sqrt(np.maximum(j_max * v + 0.5 * a**2, 0.0)), np.maximum(a_max, -a))
+        t1, t3 = (a + peak) / j_max, peak / j_max
+        v1 = v + a * t1 - 0.5 * j_max * t1**2
+        v2 = 0.5 * peak**2 / j_max
+        t2 = np.where(peak > 0.0, np.maximum(v1 - v2, 0.0) / np.where(peak > 0.0, peak, 1.0), 0.0)
+        return cls(sign, v, a, peak, t1, t2, t3, v1, v2, j_max)
+
+    @property
+    def duration(self) -> Rows:
+        """Time until each joint rests [s]."""
+        return self.t1 + self.t2 + self.t3
+
+    def velocity(self, times: Rows) -> Rows:
+        """Velocity at `times` (k,) [s] after the beginning, (n, k, 7) [rad/s]."""
+        t = times[np.newaxis, :, np.newaxis]
+        v, a, peak, v1, t1, t2 = (
+            part[:, np.newaxis] for part in (self.v, self.a, self.peak, self.v1, self.t1, self.t2)
+        )
+        left = np.maximum(self.duration[:, np.newaxis] - t, 0.0)
+        first = v + a * t - 0.5 * self.j_max * t**2
+        second = v1 - peak * (t - t1)
+        third = 0.5 * self.j_max * left**2
+        return self.sign[:, np.newaxis] * np.where(t < t1, first, np.where(t < t1 + t2, second, third))
 
 
 def _let_go(limits: ArmLimits, period_s: float, v: Rows, a: Rows) -> Rows:

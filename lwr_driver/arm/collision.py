@@ -10,6 +10,7 @@ import dataclasses
 import math
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
+from functools import cached_property
 
 import coal
 import numpy as np
@@ -126,6 +127,29 @@ class CollisionChecker:
         best = int(np.argmin(distances))
         row = float(place[best])
         return dataclasses.replace(self.clearance(postures[best]), row=int(row), time_s=row * period_s)
+
+    def distance(self, q: NDArray[np.float64]) -> float:
+        """Smallest distance in the posture q, (7,) [rad], alone and unchecked [m]."""
+        return float(self._geometry_data.distanceResults[self._nearest(q)].min_distance)
+
+    @cached_property
+    def reach(self) -> NDArray[np.float64]:
+        """Longest distance of a point of the arm or its payload from each joint in any posture, (7,) [m].
+
+        No distance changes by more than sum(reach |dq|) between two postures.
+        """
+        reach = np.zeros(JOINTS + 1)
+        for joint, shape in zip(self._links, self._geometry.geometryObjects, strict=True):
+            if joint == 0:
+                continue
+            body = shape.geometry
+            body.computeLocalAABB()
+            size = float(np.linalg.norm(body.aabb_center) + body.aabb_radius)
+            reach[joint] = max(reach[joint], float(np.linalg.norm(shape.placement.translation)) + size)
+        for joint in range(JOINTS - 1, 0, -1):
+            link = float(np.linalg.norm(self._model.jointPlacements[joint + 1].translation))
+            reach[joint] = max(reach[joint], link + reach[joint + 1])
+        return reach[1:]
 
     def _nearest(self, q: NDArray[np.float64]) -> int:
         return int(pin.computeDistances(self._model, self._data, self._geometry, self._geometry_data, q))

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from lwr_driver.guard import Retreat, Stop, stop_extent
+from lwr_driver.guard import Retreat, Stop, stop_extent, stop_paths
 from lwr_driver.motion import move_to
 from tests.lwr_driver.driver_rig import START, arm
 
@@ -85,6 +85,27 @@ def test_extent_of_every_row_looks_at_the_two_rows_before():
     # At rest there is nothing to stop.
     for bound, expected in zip(whole, (START, START, np.zeros(7)), strict=True):
         np.testing.assert_allclose(bound[0], expected, atol=1e-12)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(v=unit, a=unit, period=periods, every=st.integers(1, 5))
+def test_stop_computed_beforehand_is_the_stop_that_is_driven(v, a, period, every):
+    limits = arm().limits
+    past = history(START, v, a, np.zeros(7), period)
+    driven = rows_of(Stop(limits, period), past)[3:]
+    (path,) = stop_paths(limits, period, np.array(past[2::-1]), np.array([2]), every)
+    cycles = np.minimum(every * np.arange(len(path)), len(driven) - 1)
+    assert cycles[-1] >= len(driven) - 4  # the last three rows of `driven` are at rest
+    np.testing.assert_allclose(path, driven[cycles], atol=1e-9)
+
+
+def test_stops_computed_at_once_are_those_of_each_row():
+    limits, period = arm().limits, 5e-3
+    motion = move_to(arm(), START, START + 0.4, period, speed_scale=0.7)
+    rows = np.array([0, 1, 2, 30, 60, len(motion) - 1])
+    for row, path in zip(rows, stop_paths(limits, period, motion.q, rows), strict=True):
+        driven = rows_of(Stop(limits, period), motion.q[np.maximum(row - np.arange(4), 0)])[3:]
+        np.testing.assert_allclose(path, driven[np.minimum(np.arange(len(path)), len(driven) - 1)], atol=1e-9)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
