@@ -30,6 +30,7 @@ from runner.preflight import (
     check_start,
     check_torque,
 )
+from runner.stopping import check_stops
 
 PLAN = "plan.yaml"
 VALIDATION_PLAN = "validation.plan.yaml"
@@ -246,6 +247,7 @@ def session_motion(
             *check_motion_limits(arm, motion),
             check_torque(arm, motion, plan.payload),
             check_path(collision, motion, margin),
+            *check_stops(arm, collision, motion, plan.payload, margin),
         ]
         if folder is not None:
             items.append(check_disk(folder, len(motion)))

@@ -39,7 +39,7 @@ Triple = tuple[float, float, float]
 _RELATIVE_TOLERANCE = 0.15
 _FRICTION_SHARE = 0.02
 _BYTES_PER_CYCLE = 600.0
-_TORQUE_SHARE = 0.8
+TORQUE_SHARE = 0.8
 _GRAVITY_SHARE = 0.3
 _GRAVITY_FLOOR = 0.03
 _LOAD_SETTLES_S = 0.2
@@ -98,11 +98,12 @@ class PayloadCheck:
 
 def gravity_torque(arm: Arm, q: Vector, payload: Payload | None) -> Vector:
     """Gravity torque G(q) of the nominal arm with a payload welded to the last link, (n,) [Nm]."""
-    model = _loaded(arm, payload)
+    model = loaded_model(arm, payload)
     return np.asarray(pin.computeGeneralizedGravity(model, model.createData(), q))
 
 
-def _loaded(arm: Arm, payload: Payload | None) -> pin.Model:
+def loaded_model(arm: Arm, payload: Payload | None) -> pin.Model:
+    """The nominal arm with a payload welded to the last link."""
     model = pin.buildModelFromXML(arm.urdf)
     if payload is not None:
         model.appendBodyToJoint(model.njoints - 1, payload.body(), pin.SE3.Identity())
@@ -285,7 +286,7 @@ def check_path(checker: CollisionChecker, motion: Motion, margin: float) -> Item
 
 def check_torque(arm: Arm, motion: Motion, payload: Payload | None) -> Item:
     """Largest predicted share of a joint torque limit along the motion, by the nominal model."""
-    model = _loaded(arm, payload)
+    model = loaded_model(arm, payload)
     data = model.createData()
     step = max(1, math.ceil(0.01 / motion.period_s))
     time, q = motion.period_s * step, motion.q[::step]
@@ -299,8 +300,8 @@ def check_torque(arm: Arm, motion: Motion, payload: Payload | None) -> Item:
     return Item(
         "joint torque estimate",
         f"{arm.joint_names[joint]} {abs(tau[row, joint]):.1f} Nm at t = {row * time:.2f} s",
-        f"{_TORQUE_SHARE * arm.tau_max[joint]:.1f} Nm",
-        bool(share[row, joint] <= _TORQUE_SHARE),
+        f"{TORQUE_SHARE * arm.tau_max[joint]:.1f} Nm",
+        bool(share[row, joint] <= TORQUE_SHARE),
         "slow the motion down or take a lighter payload",
     )
 

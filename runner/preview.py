@@ -31,6 +31,7 @@ from runner.report.figure import inline_svg
 from runner.report.markup import conditions_table
 from runner.report.plot import STYLES, Line, Panel, Points
 from runner.scene import ALARM, ArmShape, Colour, add_cell, line_colour, named_page, start_server, stop_server
+from runner.stopping import check_stops
 
 Floats = NDArray[np.float64]
 
@@ -154,10 +155,12 @@ def _of_plan(path: Path) -> Planned:
             "file with that arm"
         )
     motion = excitation_rows(plan, 1)(_PERIOD_S)
+    collision = checker(arm, cell, None)
     items = [
         *check_motion_limits(arm, motion),
         check_torque(arm, motion, None),
-        check_path(checker(arm, cell, None), motion, cell.margin_m),
+        check_path(collision, motion, cell.margin_m),
+        *check_stops(arm, collision, motion, None, cell.margin_m),
     ]
     return Planned(f"plan {path.name}", arm, cell, None, motion, Preflight(tuple(items)), cell.margin_m)
 

@@ -38,6 +38,7 @@ from runner.preflight import (
     check_torque,
     load_data,
 )
+from runner.stopping import check_stops
 from runner.terminal import Interrupts
 
 Vector = npt.NDArray[np.float64]
@@ -205,11 +206,13 @@ class Steps:
         # In monitor mode the answer is the mirror, so this is the controller's own set point.
         motion = self._planned = plan(state)
         collision = checker(bench.arm, bench.cell, self.payload)
+        margin = max(experiment.moves.clearance_m, bench.cell.margin_m)
         preflight = Preflight(
             (
                 *check_motion_limits(bench.arm, motion),
                 check_torque(bench.arm, motion, self.payload),
-                check_path(collision, motion, max(experiment.moves.clearance_m, bench.cell.margin_m)),
+                check_path(collision, motion, margin),
+                *check_stops(bench.arm, collision, motion, self.payload, margin),
                 check_disk(path.parent, len(motion)),
                 check_link(state),
                 check_gravity(bench.arm, self._mean),
