@@ -8,6 +8,7 @@ _SESSIONS = "tests/runner/experiment/test_sessions.py"
 _CAUSES = "tests/ident/effects/test_every_cause.py"
 _ESTIMATORS = "tests/ident/estimators/test_estimators.py"
 _PACKETS = "tests/fri/test_packets.py"
+_STOPPING = "tests/runner/test_stopping.py"
 _GUARD = "tests/lwr_driver/test_guard.py"
 
 
@@ -41,6 +42,13 @@ BUGS: tuple[Bug, ...] = (
         "            check_gravity(bench.arm, here),\n",
         "",
         (f"{_SESSIONS}::test_nothing_moves_after_a_failed_check",),
+    ),
+    Bug(
+        "the stops of a session's motion are not checked",
+        "runner/planning.py",
+        "            *check_stops(arm, collision, motion, plan.payload, margin),\n",
+        "",
+        (f"{_STOPPING}::test_session_with_a_post_in_the_way_of_its_stops_does_not_move",),
     ),
     Bug(
         "a resumption forgets the payload",

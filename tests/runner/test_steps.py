@@ -127,6 +127,8 @@ def test_hold_enters_and_leaves_command_mode_without_motion(day: Day, tmp_path: 
     assert np.ptp(session.joint.position, axis=0).max() < 1e-3
     assert session.metadata["uid"]
     assert {"preflight.json", "plan.npz", "experiment.yaml"} <= set(session.attachments)
+    subjects = {item["subject"] for item in json.loads(session.attachments["preflight.json"])}
+    assert {"clearance of a stop", "torque of a stop"} <= subjects
 
 
 @pytest.mark.parametrize("degrees", [4.0, -4.0])

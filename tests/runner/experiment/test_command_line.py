@@ -70,7 +70,9 @@ def test_check_prints_value_and_limit_of_every_item(tmp_path: Path) -> None:
             "acceleration",
             "jerk",
             "clearance",
+            "clearance of a stop",
             "joint torque estimate",
+            "torque of a stop",
         } <= subjects
         assert all(item["value"] and item["limit"] for item in items)
 
