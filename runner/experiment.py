@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -234,6 +234,46 @@ class Bench:
         )
 
 
+@dataclass
+class CommandMode:
+    """A stay in command mode. stuck : why it was not left at its end, None if it was."""
+
+    stuck: RobotError | None = None
+
+
+@contextlib.contextmanager
+def command_mode(driver: Driver, status: StatusLine) -> Iterator[CommandMode]:
+    """Command mode, left at the end; a failure of that is in `stuck`, and said beside an exception under way."""
+    driver.enter_command()
+    stay = CommandMode()
+    try:
+        yield stay
+    except BaseException:
+        status.clear()
+        _leave(driver, stay)
+        if stay.stuck is not None:
+            status.say(str(stay.stuck))
+        raise
+    status.clear()
+    _leave(driver, stay)
+
+
+def _leave(driver: Driver, stay: CommandMode) -> None:
+    try:
+        driver.leave_command()
+    except LwrError as error:
+        stay.stuck = RobotError(
+            f"command mode was not left, the arm may be held with its drives on: {error}. Stop the KRL program at the "
+            "pendant and switch the drives off before anybody goes near"
+        )
+        stay.stuck.rows = error.rows
+
+
+def _with_stay(reason: str, stay: CommandMode) -> str:
+    """A reason, and that command mode was not left."""
+    return reason if stay.stuck is None else f"{reason}; {stay.stuck}"
+
+
 class Run:
     """One run of an experiment into one folder.
 
@@ -290,51 +330,55 @@ class Run:
         if traced:
             bench.operator.start_trace()
         self._rest = None
-        with Interrupts(driver.request_stop, driver.drop_link):
-            driver.enter_command()
-            try:
-                if not np.array_equal(motion.q[0], driver.state().q_command):
-                    # The controller moved its set point at the start of command mode.
-                    motion, preflight = self._prepare(plan, here)
-                uids = self._progress.begin(plan.name, path, self.experiment.session_uid(plan.name))
-                driver.record(
-                    path,
-                    bench.metadata(self.experiment, plan.payload, *uids),
-                    self._attachments(motion, preflight),
-                )
-                outcome = self._still_loaded(plan, here, self._drive(plan, motion))
-                recorded = driver.end_record(outcome.status, outcome.reason)
-            finally:
-                bench.status.clear()
-                with contextlib.suppress(LwrError):
-                    driver.leave_command()
+        with (
+            Interrupts(driver.request_stop, driver.drop_link),
+            command_mode(driver, bench.status) as stay,
+        ):
+            if not np.array_equal(motion.q[0], driver.state().q_command):
+                # The controller moved its set point at the start of command mode.
+                motion, preflight = self._prepare(plan, here)
+            uids = self._progress.begin(plan.name, path, self.experiment.session_uid(plan.name))
+            driver.record(
+                path,
+                bench.metadata(self.experiment, plan.payload, *uids),
+                self._attachments(motion, preflight),
+            )
+            outcome, held = self._still_loaded(plan, here, self._drive(plan, motion))
+            recorded = driver.end_record(outcome.status, outcome.reason)
         link = LinkReport.between(start, driver.state())
         if recorded.error:
-            return Record(plan.name, path, "fail", f"the log could not be written: {recorded.error}", link)
+            reason = _with_stay(f"the log could not be written: {recorded.error}", stay)
+            return Record(plan.name, path, "fail", reason, link)
         if traced:
             self._import_trace(path)
         warnings = self._torque_warnings(path) if outcome.status == "success" else ()
         for warning in warnings:
             bench.status.say(warning)
         if outcome.status == "success":
-            self._rest = self._at_rest(plan.payload)
+            # An arm that stays in command mode was measured there; its session is whole all the same.
+            self._rest = self._at_rest(plan.payload) if stay.stuck is None else held
             worst = 1000.0 * float(np.max(link.worst_tracking_error_rad))
             bench.status.say(
                 f"{plan.name}: logged {recorded.samples} samples, {link.missed} cycles missed, tracking within "
                 f"{worst:.1f} mrad"
             )
             self._progress.finish(plan.name, self._rest, recorded.samples)
-        return Record(plan.name, path, outcome.status, outcome.reason, link, outcome.error, warnings)
+            if stay.stuck is not None:
+                # Nobody may be sent to an arm in command mode: the sequence ends here.
+                return Record(plan.name, path, "fail", str(stay.stuck), link, stay.stuck, warnings)
+        reason = _with_stay(outcome.reason, stay)
+        return Record(plan.name, path, outcome.status, reason, link, outcome.error, warnings)
 
-    def _still_loaded(self, plan: SessionPlan, before: Rest, outcome: Outcome) -> Outcome:
-        """The outcome; a failure if the payload changed during the motion."""
+    def _still_loaded(self, plan: SessionPlan, before: Rest, outcome: Outcome) -> tuple[Outcome, Rest]:
+        """The outcome, a failure if the payload changed during the motion, and the arm at rest after a success."""
         if outcome.status != "success":
-            return outcome
-        check = check_payload(self.bench.arm, before, self._at_rest(plan.payload))
+            return outcome, before
+        after = self._at_rest(plan.payload)
+        check = check_payload(self.bench.arm, before, after)
         if check.ok:
-            return outcome
+            return outcome, after
         reason = f"the payload changed during the motion: {check.reason(self.bench.arm.joint_names)}"
-        return dataclasses.replace(outcome, status="fail", reason=reason, error=RobotError(reason))
+        return dataclasses.replace(outcome, status="fail", reason=reason, error=RobotError(reason)), after
 
     def _torque_warnings(self, path: Path) -> tuple[str, ...]:
         """Warnings about motor torques of the wrong joint, size or sign."""
@@ -379,6 +423,7 @@ class Run:
         if not self._asked or plan.payload != self._mounted or before is None:
             load = plan.payload
             name = "none" if load is None else f"{load.name}, {load.mass:g} kg"
+            self._require_monitor_mode()
             bench.status.say(f"payload for session {plan.name}: {name}")
             bench.operator.swap(self._mounted, plan.payload)
             if bench.driver.sets_load:
@@ -391,6 +436,15 @@ class Run:
         if not check.ok:
             raise RefusedError(check.reason(bench.arm.joint_names))
         bench.status.say(check.summary())
+
+    def _require_monitor_mode(self) -> None:
+        """Raise RobotError while the arm is commanded: nobody may mount anything then."""
+        state = self.bench.driver.state()
+        if state.state == "CMD" or state.mode != "mirror":
+            raise RobotError(
+                f"payload swap: the arm is in state {state.state}, mode {state.mode}; it must be in monitor mode (MON, "
+                "mirror). Stop the KRL program at the pendant, stay clear of the arm until then, and begin again"
+            )
 
     def _at_rest(self, payload: Payload | None) -> Rest:
         measured = self.bench.driver.monitor(self.bench.cycles(_REST_S))

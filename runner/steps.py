@@ -5,7 +5,6 @@ Nothing resumes by itself: after an abort or a fault the same step begins anew a
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -23,7 +22,7 @@ from lwr_driver.motion import Motion, move_to
 from lwr_driver.realtime import Rights
 from lwr_driver.session import read_session
 from lwr_driver.session.recording import Recorded
-from runner.experiment import Bench
+from runner.experiment import Bench, command_mode
 from runner.experiment_file import Experiment, Payload
 from runner.planning import attached_plan, checker, dwell
 from runner.preflight import (
@@ -176,25 +175,26 @@ class Steps:
         preflight = self._prepare(plan, path)
         if driver.sets_load:
             driver.set_load(*load_data(bench.arm, self.payload))
-        with Interrupts(driver.request_stop, driver.drop_link):
-            driver.enter_command()
-            try:
-                if not np.array_equal(self._planned.q[0], driver.state().q_command):
-                    # The controller moved its set point at the start of command mode.
-                    preflight = self._prepare(plan, path)
-                before = driver.state()
-                driver.record(path, self._metadata(name), self._attachments(preflight))
-                outcome = drive(before)
-                after = driver.state()
-                status, reason = ("success", "") if outcome is None else (outcome.status, outcome.reason)
-                recorded = self._end_record(status, reason)
-            finally:
-                bench.status.clear()
-                with contextlib.suppress(LwrError):
-                    driver.leave_command()
+        with (
+            Interrupts(driver.request_stop, driver.drop_link),
+            command_mode(driver, bench.status) as stay,
+        ):
+            if not np.array_equal(self._planned.q[0], driver.state().q_command):
+                # The controller moved its set point at the start of command mode.
+                preflight = self._prepare(plan, path)
+            before = driver.state()
+            driver.record(path, self._metadata(name), self._attachments(preflight))
+            outcome = drive(before)
+            after = driver.state()
+            status, reason = ("success", "") if outcome is None else (outcome.status, outcome.reason)
+            recorded = self._end_record(status, reason)
         if outcome is not None:
+            if stay.stuck is not None:
+                bench.status.say(str(stay.stuck))
             error = outcome.error if outcome.error is not None else OperatorError(outcome.reason)
             raise _failure(error, path)
+        if stay.stuck is not None:
+            raise _failure(stay.stuck, path)
         worst = 1000.0 * float(np.max(after.tracking_error))
         done = f"{done}{_moved(bench.arm.joint_names, before.q, after.q)}, tracking within {worst:.1f} mrad"
         return Step(name, done, path, recorded.samples, before.q, after.q)

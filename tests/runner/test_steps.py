@@ -301,3 +301,17 @@ def test_a_log_too_short_or_always_moving_has_no_pose(day: Day, tmp_path: Path) 
     day.steps().record(tmp_path / "short.mcap", 0.5)
     assert standstills(tmp_path / "short.mcap") == ()
     assert issubclass(RefusedError, LwrError)
+
+
+def test_an_arm_that_stays_in_command_mode_is_told(
+    day: Day, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave = day.bench.driver.leave_command
+
+    def halted() -> None:
+        raise RobotError("waited 30.0 s for monitor mode")
+
+    monkeypatch.setattr(day.bench.driver, "leave_command", halted)
+    with pytest.raises(RobotError, match=r"command mode was not left.*at the pendant"):
+        day.steps().hold(tmp_path / "hold.mcap", 1.0)
+    leave()

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fri.errors import LwrError
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import find
@@ -47,6 +48,8 @@ class Stand:
         self.during: Callable[[], None] = lambda: None
         self.at_command: Callable[[], None] = lambda: None
         self.write_error = ""
+        self.in_command = False
+        self.leave_error: LwrError | None = None
         self.packets = 0
         self.text = io.StringIO()
         self.trace: bytes | None = None
@@ -69,7 +72,8 @@ class Stand:
         return SimpleNamespace(
             period_s=PERIOD_S,
             quality=self.quality,
-            state="CMD",
+            state="CMD" if self.in_command else "MON",
+            mode="hold" if self.in_command else "mirror",
             error=self.error,
             answer_rate=1.0,
             q_command=self.q,
@@ -96,10 +100,14 @@ class Stand:
 
     def enter_command(self) -> None:
         self.calls.append(("enter_command",))
+        self.in_command = True
         self.at_command()
 
     def leave_command(self) -> None:
         self.calls.append(("leave_command",))
+        if self.leave_error is not None:
+            raise self.leave_error
+        self.in_command = False
 
     def request_stop(self) -> None:
         self.calls.append(("request_stop",))

@@ -376,3 +376,30 @@ def test_a_broken_progress_says_how_to_begin_anew(tmp_path: Path, content: str) 
     (tmp_path / "progress.json").write_text(content)
     with pytest.raises(DataError, match=r"progress\.json: cannot be read, .*; delete it"):
         ExperimentProgress.load(tmp_path)
+
+
+def test_an_arm_that_stays_in_command_mode_ends_the_run_before_anybody_is_sent_to_it(
+    stand: Stand, tmp_path: Path
+) -> None:
+    stand.leave_error = RobotError("waited 30.0 s for monitor mode")
+    (record,) = run_of(stand, tmp_path, BARE, LOADED).sessions()
+    assert (record.status, type(record.error)) == ("fail", RobotError)
+    assert "command mode was not left" in record.reason
+    assert "at the pendant" in record.reason
+    assert len(stand.of("swap")) == 1
+    # What was driven is kept: the next run goes on behind it, but not before the arm is let go.
+    with pytest.raises(RobotError, match=r"payload swap: the arm is in state CMD.*at the pendant"):
+        run_of(stand, tmp_path, BARE, LOADED).sessions()
+    stand.leave_error, stand.in_command = None, False
+    assert [record.status for record in run_of(stand, tmp_path, BARE, LOADED).sessions()] == ["success"] * 2
+
+
+def test_a_failed_leave_does_not_hide_the_failure_before_it(stand: Stand, tmp_path: Path) -> None:
+    def trouble() -> None:
+        stand.q = stand.q + 1e-3
+        stand.error = 1
+
+    stand.at_command, stand.leave_error = trouble, RobotError("waited 30.0 s for monitor mode")
+    with pytest.raises(RefusedError, match="link"):
+        run_of(stand, tmp_path).sessions()
+    assert "command mode was not left" in stand.text.getvalue().replace("\n", " ")
