@@ -32,7 +32,7 @@ from fri.errors import ConfigurationError, LwrError, NetworkError, OperatorError
 from fri.handshake import IdentificationHandshake, find_handshake
 from fri.states import Quality
 from lwr_driver.arm import Arm
-from lwr_driver.arm.load import check_load
+from lwr_driver.arm.load import LoadInForce, check_load
 from lwr_driver.commander import BRAKE, CONTACT, HOLD, RETREAT
 from lwr_driver.configuration import as_path, expect
 from lwr_driver.contact import ContactSettings, ExpectedArm
@@ -126,6 +126,7 @@ class Driver:
         self._loop: LoopProcess | HostedLoop | None = None
         self._recorder: Recorder | None = None
         self._recording = False
+        self._announced: LoadInForce | None = None
         self._stops_seen = 0
         self._notes_seen = 0
 
@@ -279,7 +280,17 @@ class Driver:
             raise RobotError(f"load data cannot change in mode {mode}; leave command mode first")
         control.plan[0] = (mass, *(1000.0 * value for value in com), *inertia)
         self._wait(Job.LOAD, f"load data of {mass:g} kg in force", advise_load, timeout_s)
+        self._announced = LoadInForce(mass, com)
         return self.state()
+
+    @property
+    def load(self) -> LoadInForce | None:
+        """Load data in force in the controller by the last packet; None where the KRL program tells none."""
+        handshake, rows = find_handshake(self.link.handshake), self.last_rows(1)
+        if not isinstance(handshake, IdentificationHandshake) or not len(rows):
+            return None
+        mass, x, y, z = handshake.load(rows[-1]["msr"]).tolist()
+        return LoadInForce(mass, (1e-3 * x, 1e-3 * y, 1e-3 * z))
 
     def expect_load(
         self,
@@ -290,19 +301,24 @@ class Driver:
         """Expect this payload in the own estimate of the external torque, at the latest when the arm rests next.
 
         Arguments as of `set_load`. Without a call the weight of the payload is taken from the controller's gravity
-        torque, its load data; the inertia is then unknown.
+        torque, its load data; the inertia is then unknown. `enter_command` refuses other load data in the controller,
+        where the KRL program tells them.
         """
         control = self._need(self._control)
+        self._announced = LoadInForce(mass, com)
         control.load[:] = (mass, *com, *inertia)
         control.words[Word.LOAD] += 1
 
     def enter_command(self, *, timeout_s: float = 120.0) -> LinkState:
         """Ask the KRL program to start commanding; wait for command mode, drives on and no error.
 
-        From then on the arm holds where the controller has it.
+        From then on the arm holds where the controller has it. Raises RefusedError, also if it shows on the way, if
+        the load data in force differ from those of `expect_load` or `set_load`: the arm would sag or rise.
         """
+        self._check_load()
         try:
             self._wait(Job.START, "command mode with drives on", advise_command, timeout_s)
+            self._check_load()
         except BaseException:
             # The request must not be granted later, with nobody waiting for it.
             if self._loop is not None:
@@ -504,6 +520,19 @@ class Driver:
         if stops != self._stops_seen:
             self._stops_seen = stops
             raise self._with_rows(OperatorError(f"stop requested while waiting for {awaited}"))
+
+    def _check_load(self) -> None:
+        """Raise RefusedError if the controller compensates another load than the announced one."""
+        announced, force = self._announced, self.load
+        if announced is None or force is None or force.agrees(announced):
+            return
+        raise self._with_rows(
+            RefusedError(
+                f"load data in force in the controller: {force}, announced: {announced}; the arm would sag or rise. "
+                "They were changed at the pendant, or the KRL program was started again: look at the tool's load data "
+                "there, and begin again, which sends the announced ones"
+            )
+        )
 
     def _check_executable(self, motion: Motion, state: LinkState) -> None:
         if state.mode != "hold" or state.left:

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fri.errors import ConfigurationError, LwrError, OperatorError, RobotError
+from fri.errors import ConfigurationError, LwrError, OperatorError, RefusedError, RobotError
 from lwr_driver.arm.collision import Clearance
+from lwr_driver.arm.load import LoadInForce
 from lwr_driver.driver import LinkState, MotionProgress, Outcome
 from lwr_driver.motion import Motion, move_to
 from lwr_driver.realtime import Rights
@@ -80,11 +81,16 @@ class Pose:
 
 @dataclass
 class Steps:
-    """Steps with a connected bench. payload : mounted on the flange, None for the empty flange."""
+    """Steps with a connected bench.
+
+    payload : mounted on the flange, None for the empty flange
+    empty : an empty flange is stated, not assumed; else load data of a payload in the controller are not replaced
+    """
 
     experiment: Experiment
     bench: Bench
     payload: Payload | None = None
+    empty: bool = False
     _mean: Rest = field(init=False, repr=False)
     _planned: Motion = field(init=False, repr=False)
 
@@ -173,8 +179,10 @@ class Steps:
         measured = driver.monitor(self.bench.cycles(_REST_S))
         self._mean = Rest(measured.q, measured.tau, self.payload)
         preflight = self._prepare(plan, path)
+        load = load_data(bench.arm, self.payload)
         if driver.sets_load:
-            driver.set_load(*load_data(bench.arm, self.payload))
+            self._keep_load(LoadInForce(*load[:2]))
+            driver.set_load(*load)
         with (
             Interrupts(driver.request_stop, driver.drop_link),
             command_mode(driver, bench.status) as stay,
@@ -198,6 +206,17 @@ class Steps:
         worst = 1000.0 * float(np.max(after.tracking_error))
         done = f"{done}{_moved(bench.arm.joint_names, before.q, after.q)}, tracking within {worst:.1f} mrad"
         return Step(name, done, path, recorded.samples, before.q, after.q)
+
+    def _keep_load(self, wanted: LoadInForce) -> None:
+        """Raise RefusedError before load data in the controller are replaced that nobody has spoken of."""
+        force = self.bench.driver.load
+        if self.payload is not None or self.empty or force is None or force.agrees(wanted):
+            return
+        raise RefusedError(
+            f"load data in force in the controller: {force}; this step would replace them by {wanted}, and nobody has "
+            "said that the flange is empty. State what is mounted: `--payload NAME`, or `--payload none` for the empty "
+            "flange"
+        )
 
     def _prepare(self, plan: Callable[[LinkState], Motion], path: Path) -> Preflight:
         """Plan the motion from the present set point and check it. RefusedError after a failed check."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,6 +13,29 @@ from fri.errors import ConfigurationError
 HEAVIEST_KG = 14.0
 FARTHEST_M = 0.5
 _TOLERANCE = 1e-6
+# Load data travel as float32, in kg and mm.
+_SAME_KG, _SAME_M = 1e-3, 1e-4
+
+
+@dataclass(frozen=True)
+class LoadInForce:
+    """Mass [kg] and centre of mass in the flange frame [m] of load data."""
+
+    mass: float
+    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def agrees(self, other: LoadInForce) -> bool:
+        """Whether these are the same load data but for rounding; false for NaN. Nothing has no centre of mass."""
+        if self.mass == other.mass == 0.0:
+            return True
+        away = max(abs(a - b) for a, b in zip(self.com, other.com, strict=True))
+        return abs(self.mass - other.mass) <= _SAME_KG and away <= _SAME_M
+
+    def __str__(self) -> str:
+        if self.mass == 0.0:
+            return "none (0 kg)"
+        x, y, z = (1e3 * value for value in self.com)
+        return f"{self.mass:.4g} kg at ({x:.4g}, {y:.4g}, {z:.4g}) mm from the flange"
 
 
 def check_load(mass: float, com: Sequence[float], inertia: Sequence[float]) -> None:

@@ -21,12 +21,15 @@ if TYPE_CHECKING:
 
 _FOLDER = Path("steps")
 _SPEED = 0.1
+_EMPTY = "none"
 _SILENCE_S = 60.0
 """A recording survives so much silence: another KRL program is selected meanwhile."""
 
 out_option = click.option("--out", type=NEW_FILE, help="Session log; default: steps/NAME-STAMP.mcap.")
 payload_option = click.option(
-    "--payload", metavar="NAME", help="Mounted payload, of FILE; default: the empty flange."
+    "--payload",
+    metavar="NAME",
+    help="Mounted payload, of FILE; `none`: the empty flange, the default unless the controller has load data.",
 )
 yes_option = click.option("--yes", is_flag=True, help="Confirm every question; for automation.")
 rights_option = click.option(
@@ -90,7 +93,7 @@ def _run(order: _Order, work: Callable[[Steps, Path], Step]) -> Step:
     if order.name == "record":
         laboratory = Laboratory(experiment, allow_non_realtime=True, status=status, silence_s=_SILENCE_S)
     with laboratory as bench:
-        return work(Steps(experiment, bench, payload), path)
+        return work(Steps(experiment, bench, payload, empty=order.payload == _EMPTY), path)
 
 
 def _log(order: _Order) -> Path:
@@ -105,10 +108,12 @@ def _log(order: _Order) -> Path:
 
 def _payload(experiment: Experiment, name: str | None) -> Any:
     known = experiment.payloads()
-    if name is not None and name not in known:
-        listed = ", ".join(known) or "none"
+    if name is None or name == _EMPTY:
+        return None
+    if name not in known:
+        listed = ", ".join(known) or "no payload"
         raise ConfigurationError(f"payload {name!r} is not in {experiment.source}; there: {listed}")
-    return None if name is None else known[name]
+    return known[name]
 
 
 def _tell(order: _Order, step: Step, *more: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fri.errors import ConfigurationError, RobotError
+from fri.errors import ConfigurationError, RefusedError, RobotError
 from lwr_driver.driver import Driver, LinkSettings
 from runner.experiment_file import Payload
 from runner.laboratory import free_port
@@ -39,6 +39,34 @@ def test_load_data_reach_the_controller_and_too_heavy_ones_do_not() -> None:
         driver.enter_command()
         with pytest.raises(RobotError, match="cannot change in mode hold"):
             driver.set_load(1.0)
+
+
+def test_no_command_mode_with_other_load_data_than_announced() -> None:
+    port = free_port("127.0.0.1")
+    settings = {"fri.program": "lwr_identification", "fri.period_ms": 5}
+    link = LinkSettings(address="127.0.0.1", port=port, lock_step=True, handshake="lwr_identification")
+    with (
+        EmulatorProcess(fri_port=port, settings=settings, hosting=True) as emulator,
+        Driver(arm(), link, host=emulator.host) as driver,
+    ):
+        driver.connect()
+        driver.wait_quality()
+        driver.expect_load(0.0)
+        emulator.pendant.set_load(2.0, (0.0, 0.0, 0.178))
+        driver.monitor(20)
+        with pytest.raises(RefusedError, match=r"2 kg at \(0, 0, 100\) mm.*announced: none.*pendant"):
+            driver.enter_command()
+        assert driver.state().state == "MON"
+        # Changed on the way to command mode: it is left again.
+        emulator.pendant.set_load(0.0)
+        driver.monitor(20)
+        emulator.pendant.schedule("set_load", after_cycles=2, mass=2.0, com=[0.0, 0.0, 0.1])
+        with pytest.raises(RefusedError, match="2 kg"):
+            driver.enter_command()
+        assert driver.state().mode == "mirror"
+        emulator.pendant.set_load(0.0)
+        driver.monitor(20)
+        driver.enter_command()
 
 
 def test_other_programs_take_none() -> None:

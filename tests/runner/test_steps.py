@@ -315,3 +315,14 @@ def test_an_arm_that_stays_in_command_mode_is_told(
     with pytest.raises(RobotError, match=r"command mode was not left.*at the pendant"):
         day.steps().hold(tmp_path / "hold.mcap", 1.0)
     leave()
+
+
+def test_load_data_at_the_controller_are_not_replaced_unasked(day: Day, tmp_path: Path) -> None:
+    day.pendant.set_load(0.8, (0.0, 0.0, 0.198))
+    day.bench.driver.monitor(20)
+    with pytest.raises(RefusedError, match=r"0\.8 kg at .*120\) mm.*by none \(0 kg\).*`--payload none`"):
+        day.steps().hold(tmp_path / "no.mcap", 1.0)
+    assert day.pendant.status()["load"]["mass"] == pytest.approx(0.8)
+    stated = Steps(day.experiment, day.bench, None, empty=True)
+    assert "held the pose" in str(stated.hold(tmp_path / "hold.mcap", 1.0))
+    assert day.pendant.status()["load"]["mass"] == 0.0
