@@ -20,7 +20,7 @@ from fri.errors import ConfigurationError
 from fri.quantities import LONGEST_LIST, LONGEST_TEXT, check_value, check_values, metas
 from lwr_driver.places import Place
 from lwr_driver.references import frozen_file, note
-from lwr_driver.yaml_text import Dumper, yaml_content
+from lwr_driver.yaml_text import Dumper, RepeatedKeyError, yaml_content
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
@@ -124,6 +124,8 @@ def read_yaml(path: Path) -> Any:
     text = read_text(path)
     try:
         return yaml_content(text)
+    except RepeatedKeyError as error:
+        raise ConfigurationError(f"{path}:{error.second}: {error}; keep one of them") from error
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError) as error:
         mark = getattr(error, "problem_mark", None)
         where = path if mark is None else f"{path}:{mark.line + 1}"

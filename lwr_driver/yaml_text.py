@@ -14,21 +14,48 @@ _FLOAT = re.compile(
     r"^[-+]?(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)[eE][-+]?[0-9]+$"
 )  # as YAML 1.2: `5e-05` too
 
+_MERGE = "tag:yaml.org,2002:merge"
+
+
+class RepeatedKeyError(yaml.YAMLError):
+    """A mapping has a key twice, where the last one would win. key; first, second : lines of it, from 1."""
+
+    def __init__(self, key: str, first: int, second: int) -> None:
+        super().__init__(f"key `{key}` stands twice, in line {first} and in line {second}")
+        self.key, self.first, self.second = key, first, second
+
+
+class _OneOfEach(Composer):
+    """Composes mappings without repeated keys; `<<` may merge several times."""
+
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        """A mapping; RepeatedKeyError for a key that it has already."""
+        node = super().compose_mapping_node(anchor)
+        seen: dict[tuple[str, str], int] = {}
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
+                named, line = (key.tag, key.value), key.start_mark.line + 1
+                if named in seen:
+                    raise RepeatedKeyError(key.value, seen[named], line)
+                seen[named] = line
+        return node
+
+
 try:
     from yaml._yaml import CParser
 except ImportError:
 
-    class Loader(yaml.SafeLoader):
+    class Loader(_OneOfEach, yaml.SafeLoader):
         """Safe types, and numbers of YAML 1.2."""
 
 else:
 
-    class Loader(Composer, CParser, SafeConstructor, Resolver):  # type: ignore[misc, no-redef]
+    class Loader(_OneOfEach, CParser, SafeConstructor, Resolver):  # type: ignore[misc, no-redef]
         """Safe types, and numbers of YAML 1.2. Composed in Python: libyaml's own composer overflows the stack."""
 
         def __init__(self, stream: Any) -> None:
             CParser.__init__(self, stream)
-            for base in (Composer, SafeConstructor, Resolver):
+            for base in (_OneOfEach, SafeConstructor, Resolver):
                 base.__init__(self)
 
 

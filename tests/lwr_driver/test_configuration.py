@@ -137,3 +137,32 @@ def test_of_several_files_the_one_with_the_key_is_named(tmp_path: Path) -> None:
     assert str(place.key("margin")) == f"{below}:2: `margin`"
     assert str(place.key("limit")) == f"{above}:1: `limit`"
     assert str(place.key("mode")) == f"{above}: `mode`"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "boxes: [a]\nmargin: 1\nboxes: []\n",
+            ":3: key `boxes` stands twice, in line 1 and in line 3; keep one",
+        ),
+        ('a:\n  - {x: 1, "x": 2}\n', ":2: key `x` stands twice, in line 2 and in line 2"),
+        ("base: &b {x: 1}\nsame:\n  <<: {y: 1, y: 2}\n", ":3: key `y` stands twice"),
+    ],
+)
+def test_a_repeated_key_is_refused_with_both_lines(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError) as caught:
+        read_yaml(path)
+    assert f"{path}{message}" in str(caught.value)
+
+
+def test_merged_keys_may_be_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(
+        "a: &a {x: 1, y: 1}\nb: &b {y: 2}\nc: {<<: [*a, *b], x: 3}\nd:\n  <<: *a\n  <<: *b\n  x: 4\n"
+    )
+    content = read_yaml(path)
+    assert content["c"] == {"x": 3, "y": 1}
+    assert content["d"]["x"] == 4
