@@ -159,7 +159,7 @@ def emulator_command(
 
     if program is not None and program.lower().endswith(".src"):
         # As every file of a command line, in the working folder; else beside the configuration.
-        if not Path(config).with_name(program).is_file():
+        if not (Path(config).parent / program).is_file():
             PATH.require(Path(program))
         if Path(program).is_file():
             program = str(Path(program).resolve())

@@ -386,9 +386,16 @@ def test_a_program_of_the_command_line_lies_in_the_working_folder(tmp_path, monk
     (tmp_path / "cell").mkdir()
     for name in ("arm.yaml", "beside.src"):
         (tmp_path / "cell" / name).write_text("")
-    for line in ("--program my_lab.src", "--program rcprg", "cell/arm.yaml --program beside.src"):
+    for line in (
+        "--program my_lab.src",
+        "--program rcprg",
+        "cell/arm.yaml --program beside.src",
+        "--program cell/beside.src",
+        "cell/arm.yaml --program ../my_lab.src",
+    ):
         CliRunner().invoke(main, ["emulator", *line.split()])
-    assert asked == [str(tmp_path / "my_lab.src"), "rcprg", "beside.src"]
+    beside = str(tmp_path / "cell/beside.src")
+    assert asked == [str(tmp_path / "my_lab.src"), "rcprg", "beside.src", beside, "../my_lab.src"]
     result = CliRunner().invoke(main, ["emulator", "--program", "my_lap.src"])
     assert result.exit_code == 2
     assert "did you mean my_lab.src?" in result.output
