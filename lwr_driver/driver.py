@@ -32,11 +32,13 @@ from fri.errors import ConfigurationError, LwrError, NetworkError, OperatorError
 from fri.handshake import IdentificationHandshake, find_handshake
 from fri.states import Quality
 from lwr_driver.arm import Arm
+from lwr_driver.arm.description import enforce_ceilings
 from lwr_driver.arm.load import LoadInForce, check_load
 from lwr_driver.commander import BRAKE, CONTACT, HOLD, RETREAT
 from lwr_driver.configuration import as_path, expect
 from lwr_driver.contact import ContactSettings, ExpectedArm
 from lwr_driver.control import BIN_NS, Control, Job, Mode, Result, Text, Word
+from lwr_driver.guard import sound_factor
 from lwr_driver.hosted_loop import HostedLoop, LoopHost
 from lwr_driver.link import (
     LinkSettings,
@@ -91,7 +93,8 @@ _POOR = (Quality.UNACCEPTABLE.name, Quality.BAD.name)
 class Driver:
     """Connection to one arm. A context manager: leaving it always stops the arm and ends both processes.
 
-    arm : limits for the guard of every cycle
+    arm : limits for the guard of every cycle; out of lock step none beyond those of the LWR4+, joint by joint along the
+        chain, whatever its file calls arm and joints (ConfigurationError)
     link : settings of the connection
     notify : called with a Waiting about twice a second while a step waits
     motor_torque : places of the motor torques in the KRL variables; None records none
@@ -116,6 +119,9 @@ class Driver:
     ) -> None:
         expect(arm, Arm, "arm of the driver", "give `Arm.load()`")
         expect(link, LinkSettings, "link of the driver", 'give `LinkSettings(address="192.168.0.100")`')
+        if not link.lock_step:
+            # FRI 1.0 reaches the LWR4+ alone, whatever an arm file calls it.
+            enforce_ceilings(arm)
         self.arm, self.link, self.motor_torque = arm, link, motor_torque
         self.contact = ContactSettings() if contact is None else contact
         self._expected, self._host = expected, host
@@ -550,7 +556,12 @@ class Driver:
             )
         check_motion(self.arm, motion)
         check_start(self.arm, motion, state.q_command)
-        if 0.0 < state.safety_limits < 1.0:
+        if not sound_factor(state.safety_limits):
+            raise RefusedError(
+                f"safety_limits in the controller's packets is {state.safety_limits:g}, it must be above 0 and finite: "
+                "no speed is safe with it. Start the KRL program again, and look at the argument of its friStart"
+            )
+        if state.safety_limits < 1.0:
             speed = np.abs(np.diff(motion.q, axis=0)).max(axis=0, initial=0.0) / motion.period_s
             share = speed / self.arm.v_max
             joint = int(share.argmax())

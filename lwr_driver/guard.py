@@ -70,6 +70,11 @@ class Violation:
         return f"{name} {self.quantity} {self.value:.5g} {unit} exceeds {self.limit:.5g} {unit}"
 
 
+def sound_factor(factor: float) -> bool:
+    """Whether the controller's `safety_limits` can be a share of the limits."""
+    return math.isfinite(factor) and factor > 0.0
+
+
 class Guard:
     """Checks the values to be sent, cycle by cycle.
 
@@ -107,8 +112,11 @@ class Guard:
         return twin
 
     def scale_velocity(self, factor: float) -> None:
-        """Reduce the velocity limit by the controller's `safety_limits` below 1."""
-        self._bounds[1] = self._limits.v_max * (factor if 0.0 < factor < 1.0 else 1.0)
+        """Reduce the velocity limit by the controller's `safety_limits` below 1.
+
+        No controller gives a factor of zero or less, or none that is finite: nothing may move with it.
+        """
+        self._bounds[1] = self._limits.v_max * (min(factor, 1.0) if sound_factor(factor) else 0.0)
 
     def check(self, q: NDArray[np.float32], cycles: int, *, remember: bool = True) -> Violation | None:
         """The limit broken by sending q `cycles` cycles after the last value, or None; then q is remembered."""

@@ -155,7 +155,12 @@ class Arm:
 
     def __post_init__(self) -> None:
         if self.model == MODEL or self.joint_names == JOINT_NAMES:
-            _enforce_ceilings(self)
+            if self.joint_names != JOINT_NAMES:
+                raise ConfigurationError(
+                    f"joints {' '.join(self.joint_names)} are not those of {MODEL}, {' '.join(JOINT_NAMES)}; for "
+                    "another arm name it in `model` and give its own limits"
+                )
+            enforce_ceilings(self)
 
     def __repr__(self) -> str:
         rows = (
@@ -245,13 +250,8 @@ def _usual(limit: float, value: float) -> bool:
     return 0.05 * limit < value <= limit * (1.0 + 1e-6)
 
 
-def _enforce_ceilings(arm: Arm) -> None:
-    """Raise ConfigurationError for a limit beyond what the LWR4+ can stand."""
-    if arm.joint_names != JOINT_NAMES:
-        raise ConfigurationError(
-            f"joints {' '.join(arm.joint_names)} are not those of {MODEL}, {' '.join(JOINT_NAMES)}; for another arm "
-            "name it in `model` and give its own limits"
-        )
+def enforce_ceilings(arm: Arm) -> None:
+    """Raise ConfigurationError for a limit beyond what the LWR4+ can stand, joint by joint along the chain."""
     given = {
         "position_deg": ("deg", np.degrees(np.maximum(np.abs(arm.q_min), np.abs(arm.q_max)))),
         "velocity_deg_s": ("deg/s", np.degrees(arm.v_max)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 
@@ -102,3 +103,13 @@ def test_text_of_a_wrong_value_is_short():
     with pytest.raises(ConfigurationError) as caught:
         Driver(np.zeros((1000, 1000)), LinkSettings())
     assert len(str(caught.value)) < 300
+
+
+def test_a_real_arm_keeps_its_ceilings_whatever_its_file_calls_it():
+    names = tuple(f"joint_{number}" for number in range(7))
+    other = dataclasses.replace(arm(), model="my arm", joint_names=names, a_max=np.full(7, 20.0))
+    with pytest.raises(
+        ConfigurationError, match=r"joint_0: acceleration_rad_s2 20 rad/s² is beyond 8 rad/s².*narrow"
+    ):
+        Driver(other, LinkSettings(address="127.0.0.1"))
+    Driver(other, LinkSettings(address="127.0.0.1", lock_step=True))

@@ -103,7 +103,7 @@ def test_controller_can_shrink_the_velocity_limit():
     assert found[0].limit == pytest.approx(0.3 * arm().v_max[found[0].joint])
 
 
-@pytest.mark.parametrize("factor", [0.0, 1.0, 1.5, np.nan])
+@pytest.mark.parametrize("factor", [1.0, 1.5])
 def test_factor_that_shrinks_nothing_changes_nothing(factor):
     watch = guard()
     watch.scale_velocity(0.1)
@@ -328,3 +328,14 @@ def test_rows_after_a_gap_are_left_to_single_checks():
     assert watch.check_rows(rest) == 5
     assert watch.check(rest[0], 2) is None
     assert watch.check_rows(rest) == 0
+
+
+@pytest.mark.parametrize("factor", [0.0, -0.5, np.nan, np.inf])
+def test_nothing_moves_with_a_factor_that_no_controller_gives(factor):
+    watch = guard()
+    watch.scale_velocity(factor)
+    rest = START.astype(np.float32)
+    assert watch.check(rest, 1) is None
+    motion = move_to(arm(), START, START + 0.5, T, speed_scale=0.05)
+    found = [violation for q in motion.q if (violation := watch.check(q.astype(np.float32), 1))]
+    assert (found[0].quantity, found[0].limit) == ("velocity", 0.0)
