@@ -351,7 +351,7 @@ class Run:
             return Record(plan.name, path, "fail", reason, link)
         if traced:
             self._import_trace(path)
-        warnings = self._torque_warnings(path) if outcome.status == "success" else ()
+        warnings = self._torque_warnings(path, recorded.motor_rejected) if outcome.status == "success" else ()
         for warning in warnings:
             bench.status.say(warning)
         if outcome.status == "success":
@@ -380,10 +380,23 @@ class Run:
         reason = f"the payload changed during the motion: {check.reason(self.bench.arm.joint_names)}"
         return dataclasses.replace(outcome, status="fail", reason=reason, error=RobotError(reason)), after
 
-    def _torque_warnings(self, path: Path) -> tuple[str, ...]:
-        """Warnings about motor torques of the wrong joint, size or sign."""
+    def _torque_warnings(self, path: Path, rejected: int) -> tuple[str, ...]:
+        """Warnings about motor torques of the wrong joint, size or sign, or not finite. The session stands anyway."""
         if self.experiment.motor_torque.source != "krl_reals":
             return ()
+        dropped: tuple[str, ...] = ()
+        if rejected:
+            dropped = (
+                f"{path.name}: {rejected} samples of the motor torques were not finite and are left out; check what "
+                "the KRL program writes into the variables of `motor_torque.krl.reals`",
+            )
+        try:
+            return dropped + self._mismatches(path)
+        except (LwrError, ValueError, ArithmeticError) as error:
+            return (*dropped, f"{path.name}: motor torques were not compared with the sensors: {error}")
+
+    def _mismatches(self, path: Path) -> tuple[str, ...]:
+        """Warnings about motor torques of the wrong joint, size or sign."""
         session = read_session(path)
         if session.motor is None or len(session.motor) < 2:
             return (
@@ -477,7 +490,11 @@ class Run:
             f"`lwr-run attach {path} TRACE --force` adds them later"
         )
         if self.bench.operator.save_trace(trace):
-            text = str(import_trace(path, trace))
+            try:
+                text = str(import_trace(path, trace))
+            except LwrError as error:
+                # The session is driven and logged; the trace can be added to it later.
+                text = f"{error}. {path.name} has no motor torques; `lwr-run attach {path} TRACE --force` adds them"
         self.bench.status.say(text)
 
     def _named_files(self) -> dict[str, bytes]:

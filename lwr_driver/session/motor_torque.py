@@ -80,6 +80,7 @@ class KrlTorqueDecoder:
     fresh : samples so far; lost : values overwritten between two cycles
     restarts : jumps of the counter (a new start of the KRL program)
     torn : cycles with new values without a new counter (a KRL program writing the counter first)
+    rejected : fresh samples with a value that is not finite; they are dropped, and missing in the numbers
     """
 
     def __init__(self, config: KrlMotorTorque) -> None:
@@ -88,6 +89,7 @@ class KrlTorqueDecoder:
         self.lost = 0
         self.restarts = 0
         self.torn = 0
+        self.rejected = 0
         self._columns = [slot - 1 for slot in config.reals]
         self._factor = np.array(config.scale) * np.array(config.sign)
         self._counter: int | None = None
@@ -130,13 +132,12 @@ class KrlTorqueDecoder:
             numbers.append(self._number)
         if len(counter):
             self._counter, self._values = int(counter[-1]), values[-1:].copy()
+        effort = values[rows].astype(np.float64) * self._factor
+        finite = np.isfinite(effort).all(axis=1)
+        rows, numbered = rows[finite], np.array(numbers, dtype=np.int64)[finite]
+        self.rejected += int((~finite).sum())
         self.fresh += len(rows)
-        return FreshTorques(
-            log_time[rows],
-            publish_time[rows],
-            np.array(numbers, dtype=np.int64),
-            values[rows].astype(np.float64) * self._factor,
-        )
+        return FreshTorques(log_time[rows], publish_time[rows], numbered, effort[finite])
 
 
 @dataclass(frozen=True)

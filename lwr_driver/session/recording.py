@@ -55,6 +55,7 @@ class Recorded:
     samples : rows in the log; missed : packets of the controller not in it
     overruns : rows dropped by the loop, the ring being full; rejected : rows without a rising packet count
     motor_samples, motor_lost : fresh motor torques in the log, and overwritten ones
+    motor_rejected : motor torques left out, not being finite
     error : reason of an incomplete file; empty for a complete one
     """
 
@@ -67,6 +68,7 @@ class Recorded:
     rejected: int = 0
     motor_samples: int = 0
     motor_lost: int = 0
+    motor_rejected: int = 0
     error: str = ""
 
 
@@ -157,6 +159,7 @@ class Recording:
                 "motor_lost": str(decoder.lost),
                 "motor_restarts": str(decoder.restarts),
                 "motor_torn": str(decoder.torn),
+                "motor_rejected": str(decoder.rejected),
             }
         try:
             self._writer.close(exit_status, reason, more)
@@ -172,6 +175,7 @@ class Recording:
             rejected=self.rejected,
             motor_samples=decoder.fresh if decoder is not None else 0,
             motor_lost=decoder.lost if decoder is not None else 0,
+            motor_rejected=decoder.rejected if decoder is not None else 0,
             error=error,
         )
 

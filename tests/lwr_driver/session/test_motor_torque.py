@@ -108,8 +108,21 @@ def test_nan_that_is_held_is_no_change():
     decoder = KrlTorqueDecoder(config)
     times = np.arange(4)
     fresh = decoder.decode(times, times, real, integer)
-    assert np.isnan(fresh.effort[0, 3])
-    assert decoder.torn == 0
+    assert len(fresh.effort) == 0
+    assert (decoder.torn, decoder.rejected) == (0, 1)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_sample_that_is_not_finite_is_left_out_counted_and_missing_in_the_numbers(value):
+    config = KrlMotorTorque()
+    real, integer = cycles([1, 2, 3, 4], config)
+    real[2, config.reals[3] - 1] = value
+    decoder = KrlTorqueDecoder(config)
+    times = np.arange(4)
+    fresh = decoder.decode(times, times, real, integer)
+    assert fresh.sequence.tolist() == [2, 4]
+    assert np.isfinite(fresh.effort).all()
+    assert (decoder.fresh, decoder.rejected) == (2, 1)
 
 
 @pytest.mark.parametrize(

@@ -162,3 +162,16 @@ def test_clock_offset_is_that_of_the_two_clocks():
 
     offset = utc_offset_ns()
     assert abs(time.time_ns() - time.monotonic_ns() - offset) < 10**9
+
+
+def test_one_motor_torque_that_is_not_finite_costs_its_own_sample_alone(tmp_path):
+    data = rows(COUNT)
+    whole = record(tmp_path / "whole.mcap", data)
+    counter = data["msr"]["krl_int"][:, 0]
+    fresh = np.flatnonzero(np.diff(counter))[5] + 1
+    data["msr"]["krl_real"][counter == counter[fresh], 2] = np.nan
+    recorded = record(tmp_path / "a.mcap", data)
+    session = read_session(tmp_path / "a.mcap")
+    assert len(session.motor) == recorded.motor_samples == whole.motor_samples - 1
+    assert recorded.motor_rejected == 1
+    assert session.end["motor_rejected"] == "1"

@@ -48,6 +48,7 @@ class Stand:
         self.during: Callable[[], None] = lambda: None
         self.at_command: Callable[[], None] = lambda: None
         self.write_error = ""
+        self.motor_rejected = 0
         self.in_command = False
         self.leave_error: LwrError | None = None
         self.packets = 0
@@ -132,7 +133,7 @@ class Stand:
 
     def end_record(self, status: str, reason: str) -> SimpleNamespace:
         self.calls.append(("end_record", status, reason))
-        return SimpleNamespace(error=self.write_error, samples=0)
+        return SimpleNamespace(error=self.write_error, samples=0, motor_rejected=self.motor_rejected)
 
     # -- person and onlooker ---------------------------------------------------------------------------------
 

@@ -168,7 +168,9 @@ def test_a_failed_motion_keeps_its_error(stand: Stand, tmp_path: Path) -> None:
 def test_warnings_about_the_data_of_a_finished_session_are_said_and_kept(
     stand: Stand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: str, warned: bool
 ) -> None:
-    monkeypatch.setattr(Run, "_torque_warnings", lambda run, path: (f"{path.name}: A2 looks like A3",))
+    monkeypatch.setattr(
+        Run, "_torque_warnings", lambda run, path, rejected: (f"{path.name}: A2 looks like A3",)
+    )
     stand.outcome = (status, "", None)
     (record,) = run_of(stand, tmp_path).sessions()
     assert record.warnings == (("bare.mcap: A2 looks like A3",) if warned else ())
@@ -403,3 +405,21 @@ def test_a_failed_leave_does_not_hide_the_failure_before_it(stand: Stand, tmp_pa
     with pytest.raises(RefusedError, match="link"):
         run_of(stand, tmp_path).sessions()
     assert "command mode was not left" in stand.text.getvalue().replace("\n", " ")
+
+
+def test_a_log_that_cannot_be_read_back_does_not_undo_the_session(stand: Stand, tmp_path: Path) -> None:
+    stand.motor_rejected = 2
+    run = run_of(stand, tmp_path, source="krl_reals")  # the stand's log is no MCAP file
+    (record,) = run.sessions()
+    assert record.status == "success"
+    assert "2 samples of the motor torques were not finite" in record.warnings[0]
+    assert "were not compared with the sensors" in record.warnings[1]
+    assert "bare" in json.loads((tmp_path / "progress.json").read_text())["finished"]
+
+
+def test_a_trace_that_cannot_be_read_does_not_undo_the_session(stand: Stand, tmp_path: Path) -> None:
+    stand.trace = b"no trace"
+    (tmp_path / "bare.trace.csv").write_bytes(stand.trace)
+    (record,) = run_of(stand, tmp_path, source="trace_file").sessions()
+    assert record.status == "success"
+    assert "--force` adds them" in stand.text.getvalue().replace("\n", " ")
