@@ -18,6 +18,8 @@ A message has subject, value, limit and advice, for example
 from __future__ import annotations
 
 import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 # Advice by the number of the operating system's error.
@@ -79,6 +81,17 @@ class FileError(ConfigurationError, OSError):
         text = f"{named}: {cause}" if named else cause
         remedy = advice or _ADVICE.get(error.errno or 0, "see that the place exists and is yours to use")
         return cls(f"{text}; {remedy}")
+
+
+@contextmanager
+def naming(path: object) -> Iterator[None]:
+    """Name `path` in an error of the operating system that names no file, as that of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, LwrError) or error.filename is not None:
+            raise
+        raise FileError.of(error, str(path)) from error
 
 
 class RefusedError(LwrError):

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fri.errors import ConfigurationError
+from fri.errors import ConfigurationError, naming
 
 FOLDER = "files"
 MANIFEST = "files.json"
@@ -224,7 +224,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _write(path: Path, content: dict[str, Any]) -> None:
     draft = path.with_suffix(".json.new")
-    with draft.open("w", encoding="utf-8") as stream:
+    with naming(draft), draft.open("w", encoding="utf-8") as stream:
         json.dump(content, stream, indent=1)
         stream.flush()
         os.fsync(stream.fileno())

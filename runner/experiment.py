@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fri.errors import DataError, LwrError, RefusedError, RobotError
+from fri.errors import DataError, LwrError, RefusedError, RobotError, naming
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import find
@@ -129,7 +129,7 @@ class ExperimentProgress:
     def _save(self) -> None:
         content = {"origin": str(self.origin or ""), "finished": self.finished, "attempts": self.attempts}
         draft = self.path.with_suffix(".json.new")
-        with draft.open("w", encoding="utf-8") as stream:
+        with naming(draft), draft.open("w", encoding="utf-8") as stream:
             json.dump(content, stream, indent=1)
             stream.flush()
             os.fsync(stream.fileno())

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fri.errors import LwrError
+from fri.errors import LwrError, naming
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import DRIVE, split_name
 from ident.estimation.comparison import compared
@@ -262,9 +262,15 @@ def write_results(
     if found is not None:
         files = {file["path"]: file["sha256"] for file in summary.get("files", ())}
         write_model(named_model(found.model, arm.name, files), folder / MODEL)
-    (folder / "report.txt").write_text(text_of(report) + "\n", encoding="utf-8")
+    write_text(folder / "report.txt", text_of(report))
     write_json(folder / SUMMARY, summary)
     return report
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text with one end of line behind it; FileError with the path where the disk refuses it."""
+    with naming(path):
+        path.write_text(f"{text.rstrip()}\n", encoding="utf-8")
 
 
 def _earlier_link(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
@@ -356,7 +362,7 @@ def write_log_results(
         **estimated(found, model, sessions, tested),
     }
     write_model(model, folder / MODEL)
-    (folder / "report.txt").write_text(text + "\n", encoding="utf-8")
+    write_text(folder / "report.txt", text)
     write_json(folder / SUMMARY, summary)
     from runner.report.page import write_report
 

@@ -115,7 +115,7 @@ def command(
     from runner.laboratory import Laboratory
     from runner.planning import Excitations
     from runner.replanning import Rounds, rounds_begun
-    from runner.results import estimate, held_out_errors, summarise, write_results
+    from runner.results import estimate, held_out_errors, summarise, write_results, write_text
 
     status, ahead = StatusLine(), None
     experiment, folder = _begin(file, out, resume, hide, replan or 0, status)
@@ -137,37 +137,38 @@ def command(
     if done:
         status.show("estimating the model")
     found = estimate(experiment, arm, records, status.say) if done else None
-    summary = summarise(experiment, records, found)
-    summary["files"] = [dataclasses.asdict(file) for file in Frozen(folder).files()]
-    tables = write_results(folder, experiment, arm, summary, found)
-    if found is not None:
-        status.say(held_out_errors(summary, folder))
-    more, advice = [], []
-    if done and experiment.diagnosis.run and not no_diagnosis:
-        if ahead is not None:
-            ahead.join()
-        from runner.diagnosis.after_run import conclude_run
+    with remarked(status, failed=not done):
+        summary = summarise(experiment, records, found)
+        summary["files"] = [dataclasses.asdict(file) for file in Frozen(folder).files()]
+        tables = write_results(folder, experiment, arm, summary, found)
+        if found is not None:
+            status.say(held_out_errors(summary, folder))
+        more, advice = [], []
+        if done and experiment.diagnosis.run and not no_diagnosis:
+            if ahead is not None:
+                ahead.join()
+            from runner.diagnosis.after_run import conclude_run
 
-        status.show("diagnosing model errors")
-        concluded = conclude_run(
-            experiment, arm, cell, motions, folder, records, laboratory=laboratory, decide=decide
-        )
-        summary |= concluded.to_dict()
-        tables += concluded.pieces(folder)
-        more = [] if concluded.study is None else [concluded.study.said.headline]
-        advice = concluded.advice(folder)
-    if experiment.sealed:
-        advice.append(
-            f"An effect is hidden in the emulated arm; `lwr-run experiment --reveal {folder}` shows it."
-        )
-    (folder / "report.txt").write_text(f"{text_of(tables).rstrip()}\n", encoding="utf-8")
-    status.show("writing the report")
-    page = _page(folder, status)
-    status.clear()
-    if as_json:
-        hold_json({**summary, "folder": str(folder)})
-    else:
-        of_folder(folder, page, tables, more, advice).tell()
+            status.show("diagnosing model errors")
+            concluded = conclude_run(
+                experiment, arm, cell, motions, folder, records, laboratory=laboratory, decide=decide
+            )
+            summary |= concluded.to_dict()
+            tables += concluded.pieces(folder)
+            more = [] if concluded.study is None else [concluded.study.said.headline]
+            advice = concluded.advice(folder)
+        if experiment.sealed:
+            advice.append(
+                f"An effect is hidden in the emulated arm; `lwr-run experiment --reveal {folder}` shows it."
+            )
+        write_text(folder / "report.txt", text_of(tables))
+        status.show("writing the report")
+        page = _page(folder, status)
+        status.clear()
+        if as_json:
+            hold_json({**summary, "folder": str(folder)})
+        else:
+            of_folder(folder, page, tables, more, advice).tell()
     if not done:
         raise _failure(records[-1], folder)
     if summary.get("unscored"):
@@ -185,6 +186,18 @@ def _page(folder: Path, status: StatusLine) -> Path | None:
     except LwrError as error:
         status.say(f"no report.html: {error}")
         return None
+
+
+@contextmanager
+def remarked(status: StatusLine, *, failed: bool) -> Iterator[None]:
+    """After a failed session, an error of its report is a remark beside the failure, such as the full disk of both."""
+    try:
+        yield
+    except (LwrError, OSError) as error:
+        if not failed:
+            raise
+        status.clear()
+        status.say(f"no report: {error}")
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 
+from fri.errors import naming
 from runner.computer import versions
 from runner.report import sections
 from runner.report.diagnosis import DiagnosisFolder, diagnosis_parts, diagnosis_section
@@ -85,7 +86,8 @@ def diagnosis_html(diagnosis: DiagnosisFolder) -> str:
 def write_page(text: str, target: Path) -> Path:
     """Write a page, whole or not at all; returns its path."""
     draft = target.with_suffix(".html.part")
-    draft.write_text(text, encoding="utf-8")
+    with naming(draft):
+        draft.write_text(text, encoding="utf-8")
     draft.replace(target)
     return target
 

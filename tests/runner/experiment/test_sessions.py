@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fri.errors import DataError, RefusedError, RobotError
+from fri.errors import DataError, FileError, RefusedError, RobotError
 from lwr_driver.arm import Arm
+from runner.commands.experiment import remarked
 from runner.experiment import ExperimentProgress, LinkReport, Run
 from runner.experiment_file import Link, Payload, SessionPlan
 from runner.preflight import Rest, gravity_torque, load_data
+from runner.results import write_text
 from runner.status import StatusLine
 from tests.runner.experiment.stand import HOME, LOAD, PERIOD_S, Stand, excite, experiment, run_of
 
@@ -423,3 +425,21 @@ def test_a_trace_that_cannot_be_read_does_not_undo_the_session(stand: Stand, tmp
     (record,) = run_of(stand, tmp_path, source="trace_file").sessions()
     assert record.status == "success"
     assert "--force` adds them" in stand.text.getvalue().replace("\n", " ")
+
+
+def test_a_full_disk_names_its_file(tmp_path: Path) -> None:
+    (tmp_path / "progress.json.new").symlink_to("/dev/full")
+    with pytest.raises(FileError, match=r"progress\.json\.new: No space left on device; make room"):
+        ExperimentProgress.create(tmp_path, tmp_path)
+    (tmp_path / "report.txt").symlink_to("/dev/full")
+    with pytest.raises(FileError, match=r"report\.txt: No space left on device"):
+        write_text(tmp_path / "report.txt", "verdict")
+
+
+def test_a_report_that_fails_after_a_failed_session_is_a_remark(stand: Stand, tmp_path: Path) -> None:
+    (tmp_path / "report.txt").symlink_to("/dev/full")
+    with remarked(StatusLine(stand.text), failed=True):
+        write_text(tmp_path / "report.txt", "verdict")
+    assert "no report: " in stand.text.getvalue()
+    with pytest.raises(FileError), remarked(StatusLine(stand.text), failed=False):
+        write_text(tmp_path / "report.txt", "verdict")
