@@ -65,6 +65,10 @@ _LONGEST_DRAIN_S = 0.05
 _SHORTEST_FLOOD_S = 0.005
 
 
+# A restart takes so many cycles at least.
+_RESTART_CYCLES = 2
+
+
 class LinkEventKind(Enum):
     """Kinds of rare events on the link."""
 
@@ -120,6 +124,9 @@ class RemoteEnd:
     sequence : int
         Unwrapped number of the last measurement; state, quality, power, control, error (int), timestamp_s and
         sample_time_s are its fields, received_ns the monotonic time of its arrival.
+    host_clock : bool
+        Whether this computer's clock tells how long a controller was away; after a restart `sequence` has left out
+        the cycles of that time. One cycle is left out at least, and no more where this is False (in lock step).
     commanding : bool
         Whether its answer moves the arm: state CMD and drives on.
     events : deque of LinkEvent
@@ -204,6 +211,7 @@ class RemoteEnd:
         self.malformed = 0
         self.malformed_by: dict[Fault, int] = dict.fromkeys(Fault, 0)
         self.foreign = 0
+        self.host_clock = True
         self.port_changes = 0
         self.unreflected = 0
         self.send_errors = 0
@@ -551,6 +559,9 @@ class RemoteEnd:
             if arrival is not Arrival.RESTARTED:
                 return False
             self._restarted()
+            # The time without a controller is a gap in the numbers, too.
+            away = (now_ns - self.received_ns) * 1e-9 / msr.sample_time if self.host_clock else 0.0
+            tracker.skip(max(round(away), _RESTART_CYCLES) - 1)
         if self._answered_last and tracker.lost == losses and msr.refl_seq != self.send_seq:
             self.unreflected += 1
         self._answered_last = False

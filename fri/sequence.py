@@ -37,7 +37,7 @@ class SequenceTracker:
     """Unwraps `send_seq` and counts.
 
     sequence : number of the newest packet. It starts with the first packet's own count and always increases; after
-    a restart of the controller it goes on with the next number.
+    a restart of the controller it goes on with the next number, or later with ``skip``.
     lost : packets missing, or arrived after a newer one. repeated, reordered, suspect, restarts : repeated packets;
     packets after a newer one; packets with an implausible counter; restarts
     """
@@ -96,6 +96,10 @@ class SequenceTracker:
         """Take in `count` packets, each the successor of the one before; the last has this counter and timestamp."""
         self._advance(1, send_seq, timestamp)
         self.sequence += count - 1
+
+    def skip(self, cycles: int) -> None:
+        """Leave out `cycles` numbers before the newest packet; they are not counted as lost."""
+        self.sequence += cycles
 
     def _advance(self, step: int, send_seq: int, timestamp: float) -> Arrival:
         self.sequence += step

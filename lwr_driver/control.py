@@ -83,6 +83,7 @@ class Word(IntEnum):
     STOP = 8  # count of stop requests
     DROP = 9
     QUIT = 10
+    BEAT_NS = 11  # CLOCK_MONOTONIC of the last sign of life while a motion is executed, 0 without any
     # written by the loop
     DONE = 16  # number of the last finished request, written after its result
     RESULT = 17

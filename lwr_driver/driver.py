@@ -133,6 +133,7 @@ class Driver:
         self._recorder: Recorder | None = None
         self._recording = False
         self._announced: LoadInForce | None = None
+        self._restarts = 0  # of the controller, before the session being recorded
         self._stops_seen = 0
         self._notes_seen = 0
 
@@ -337,7 +338,8 @@ class Driver:
         """Command a motion from its first row to its last, then hold the last row.
 
         The first row must be the commanded position, `state().q_command`, to the last bit of float32.
-        `progress` is called about ten times a second; an exception from it stops the arm and is passed on.
+        `progress` is called about ten times a second; an exception from it stops the arm and is passed on, and so does
+        one that takes longer than a second out of lock step: an arm does not move on while nobody could stop it.
 
         Raises RefusedError, before anything moves, if the motion breaks a limit or begins elsewhere, and
         RobotError outside command mode. Failures after the beginning are in the outcome, not raised.
@@ -351,6 +353,7 @@ class Driver:
             )
         self._check_executable(motion, state)
         control.put_motion(motion.q, self._number_phases(motion))
+        control.words[Word.BEAT_NS] = time.monotonic_ns()
         self._need(self._control).post(Job.MOTION, a=len(motion), b=self._stops_seen)
         names = dict(zip(control.phase_ids.tolist(), (name for _, name in motion.phases), strict=False))
         trouble: LwrError | None = None
@@ -359,6 +362,7 @@ class Driver:
         try:
             while not self._need(self._control).done:
                 time.sleep(_MOTION_POLL_S)
+                control.words[Word.BEAT_NS] = time.monotonic_ns()
                 watch.check(self.link.lock_step_patience_s)
                 if time.monotonic() < following:
                     continue
@@ -450,12 +454,14 @@ class Driver:
                 virtual_epoch_ns=LOCK_STEP_EPOCH_NS if self.link.lock_step else None,
             )
         )
+        self._restarts = int(self._need(self._control).words[Word.RESTARTS])
         self._recording = True
 
     def end_record(self, status: ExitStatus, reason: str = "") -> Recorded:
         """Write everything received so far, then the closing record."""
         self._recording = False
-        return self._need(self._recorder).close(status, reason)
+        restarts = int(self._need(self._control).words[Word.RESTARTS]) - self._restarts
+        return self._need(self._recorder).close(status, reason, restarts=restarts)
 
     # -- inside ----------------------------------------------------------------------------------------------
 

@@ -49,6 +49,7 @@ _LEAVE_ALONE = (Job.NONE, Job.MOTION, Job.CYCLES)
 _RING_SHARE = 4
 # What the watch sees of a packet.
 _WATCHED = ("msr_jnt_pos", "msr_jnt_trq", "est_ext_jnt_trq", "gravity")
+_NOBODY_S = 1.0  # a motion goes on so long without a sign of life of the driver's process
 _REMIND_S = 1.0  # silence in lock step before a reminder to the other side
 _STILL_RAD = 1e-5  # largest step per cycle of a set point at rest
 # A motion ends after so many packets of quality UNACCEPTABLE in command mode, or so long below OK.
@@ -149,6 +150,7 @@ class Loop:
         self._handshake = find_handshake(settings.handshake)
         self.remote = RemoteEnd(settings.address, settings.port, settings.controller, network=network)
         self.remote.set_torque_sign(settings.torque_sign)
+        self.remote.host_clock = not settings.lock_step
         self._commander = Commander(limits, control, settings.joint_names, settings.tracking_limit_rad)
         self._words = control.words
         msr = self.remote.msr
@@ -349,6 +351,11 @@ class Loop:
     def _passed(self, counted: int, sent: bool) -> int:
         """How many of the `counted` cycles have passed by the clocks; 0 for a packet ahead of its time."""
         remote, pace = self.remote, self.pace
+        if remote.restarts != self._restarts:
+            # Neither clock goes on over a restart.
+            self._stamps = Stamps()
+            self._count += counted
+            return counted
         passed = self._stamps.feed(counted, remote.timestamp_s, remote.sample_time_s)
         if pace is not None:
             passed = pace.feed(counted, remote.received_ns, answered=sent)
@@ -573,6 +580,12 @@ class Loop:
         elif self._alarm is None and commander.mode is Mode.MOTION and self._stale is not None:
             what = f"{self._stale.describe(self._settings.joint_names)} {commander.place()}; {self._stale.advice}"
             self._alarm = partial(commander.stop, Result.ROBOT, what)
+        elif self._alarm is None and commander.mode is Mode.MOTION and (silence := self._unwatched()):
+            what = (
+                f"no sign of life of the driver's process for {silence:.1f} s {commander.place()}: it was suspended, "
+                "or this computer is overloaded"
+            )
+            self._alarm = partial(commander.stop, Result.ABORTED, what)
         elif (
             self._alarm is None
             and commander.mode is Mode.MOTION
@@ -591,6 +604,12 @@ class Loop:
         if self._alarm is not None and not (sent and moves):
             self._alarm()
             self._alarm = None
+
+    def _unwatched(self) -> float:
+        """How long the driver's process has given no sign of life [s]; 0 below the limit, and in lock step."""
+        beat = int(self._words[Word.BEAT_NS])
+        silence = 1e-9 * (self.remote.received_ns - beat)
+        return silence if beat and silence > _NOBODY_S and not self._settings.lock_step else 0.0
 
     def _too_fast(self) -> str:
         where = self._commander.place()

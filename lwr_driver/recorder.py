@@ -130,13 +130,21 @@ class Recorder:
             raise
 
     def close(
-        self, exit_status: ExitStatus = "success", reason: str = "", *, upto: int | None = None
+        self,
+        exit_status: ExitStatus = "success",
+        reason: str = "",
+        *,
+        upto: int | None = None,
+        restarts: int = 0,
     ) -> Recorded:
         """End the session with all rows published until now, or until row number `upto`.
 
+        restarts : of the controller in this session, for its closing record
+
         For a session already ended by a failure (disk full, loop dead), that end is returned.
         """
-        answer: Recorded = self._ask("close", exit_status, reason, self.ring.head if upto is None else upto)
+        upto = self.ring.head if upto is None else upto
+        answer: Recorded = self._ask("close", exit_status, reason, upto, restarts)
         self._path = None
         return answer
 
@@ -283,12 +291,12 @@ class _Server:
             raise DataError("no session is open, so phases have no place")
         return self._recording.add_phases(names)
 
-    def _close(self, exit_status: ExitStatus, reason: str, upto: int) -> Recorded:
+    def _close(self, exit_status: ExitStatus, reason: str, upto: int, restarts: int) -> Recorded:
         if self._recording is not None:
             self._drain(upto)
             self._watch_writer()
         if self._recording is not None:
-            recorded = self._recording.close(exit_status, reason, self._lost_rows())
+            recorded = self._recording.close(exit_status, reason, self._lost_rows(), restarts)
             self._recording = None
             return recorded
         if self._ended is None:

@@ -282,8 +282,15 @@ def write_json(path: Path, content: Any) -> None:
     write_checked(path, to_json(content) + "\n", check)
 
 
+_STOPPING = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGTSTP", "SIGQUIT") if hasattr(signal, name)
+)
+
+
 class Interrupts:
-    """Ctrl-C during a motion, as a context manager. SIGTERM counts as one Ctrl-C.
+    """Ctrl-C during a motion, as a context manager. SIGTERM, Ctrl-Z and Ctrl-\\ count as one Ctrl-C.
+
+    A suspended runner could not stop the arm any more, which its own process drives on.
 
     on_first : called at the first interrupt; requests the jerk-limited stop. on_second : called at the second;
     stops the answers, and the controller leaves command mode by itself.
@@ -295,7 +302,7 @@ class Interrupts:
         self.count = 0
 
     def __enter__(self) -> Self:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in _STOPPING:
             self._previous[number] = signal.signal(number, self._handle)
         return self
 

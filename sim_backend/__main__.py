@@ -69,6 +69,10 @@ def main(
             # Ctrl-C at a terminal goes to all its processes. A child ends with its parent instead, after the
             # parent has braked the arm.
             signal.signal(signal.SIGINT, signal.SIG_IGN if follow_stdin else lambda *_: service.stop())
+            # As Ctrl-C, Ctrl-Z and Ctrl-\ are for the command above: it brakes the arm, and needs it for that.
+            for name in ("SIGTSTP", "SIGQUIT"):
+                if follow_stdin and hasattr(signal, name):
+                    signal.signal(getattr(signal, name), signal.SIG_IGN)
             if announce:
                 click.echo(json.dumps({"pendant_port": service.pendant.port}))
             else:

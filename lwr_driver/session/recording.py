@@ -149,10 +149,17 @@ class Recording:
             )
         writer.advance(int(log_time[-1]))
 
-    def close(self, exit_status: ExitStatus, reason: str, overruns: int = 0) -> Recorded:
-        """End the session; `Recorded.error` tells of an incomplete file."""
+    def close(
+        self, exit_status: ExitStatus, reason: str, overruns: int = 0, restarts: int | None = None
+    ) -> Recorded:
+        """End the session; `Recorded.error` tells of an incomplete file.
+
+        restarts : of the controller, None if unknown
+        """
         decoder, error = self._decoder, ""
         more = {"overruns": str(overruns), "rejected": str(self.rejected)}
+        if restarts is not None:
+            more["restarts"] = str(restarts)
         if decoder is not None:
             more |= {
                 "motor_samples": str(decoder.fresh),

@@ -374,18 +374,33 @@ def test_command_mode_does_not_move_to_another_port(end, controller, monkeypatch
     second.close()
 
 
-def test_restart_clears_requests_and_goes_on_counting(end, controller):
+def test_restart_clears_requests_and_goes_on_counting(end, controller, monkeypatch):
     end.krl_int[15] = 10
     end.set_krl_bool(3, True)
     controller.number = 5000
     for _ in range(3):
         exchange(end, controller, state=State.CMD, control=Control.JNT_IMP)
+    monkeypatch.setattr("fri.remote.monotonic_ns", lambda: end.received_ns)
     controller.number = 6
     answer = exchange(end, controller, state=State.MON, control=Control.POSITION)
-    assert (end.restarts, end.lost, end.sequence) == (1, 0, 5004)
+    assert (end.restarts, end.lost, end.sequence) == (1, 0, 5005)
     assert int(answer["krl_int"][15]) == int(answer["krl_bool"]) == 0
     assert int(answer["cmd_flags"]) == 0x0001
     assert end.events[-1].kind is LinkEventKind.RESTARTED
+
+
+@pytest.mark.parametrize(("host_clock", "numbers"), [(True, 3000), (False, 2)])
+def test_the_time_of_a_restart_is_a_gap_in_the_numbers(end, controller, monkeypatch, host_clock, numbers):
+    end.host_clock = host_clock
+    controller.number = 5000
+    for _ in range(3):
+        exchange(end, controller)
+    before, heard = end.sequence, end.received_ns
+    cycles = 1e9 * end.sample_time_s
+    monkeypatch.setattr("fri.remote.monotonic_ns", lambda: heard + round(3000 * cycles))
+    controller.number = 6
+    exchange(end, controller)
+    assert (end.restarts, end.lost, end.sequence) == (1, 0, before + numbers)
 
 
 def test_pending_tells_that_the_packet_in_hand_is_stale(end, controller):

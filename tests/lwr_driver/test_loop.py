@@ -784,3 +784,21 @@ def test_without_a_request_the_answer_made_ready_begins_no_motion(rig) -> None:
     one.loop._commander.foresee = lambda sequence, rows, most: asked.append((rows, most))
     one.loop._make_ready(SimpleNamespace(disarm=lambda: one.control.words, most=4))
     assert asked == [(0, 1)]
+
+
+def test_a_motion_stops_within_the_limits_when_the_driver_gives_no_sign_of_life(rig):
+    r = rig(lock_step=False)
+    r.control.words[Word.BEAT_NS] = 2**62
+    in_motion(r, 300)
+    r.control.words[Word.BEAT_NS] = r.loop.remote.received_ns - 1_100_000_000
+    assert r.until_done() is Result.ABORTED
+    assert "no sign of life of the driver's process for 1.1 s at row " in r.reason
+    assert r.mode is Mode.HOLD
+    check_sent(r)
+
+
+def test_lock_step_knows_no_sign_of_life(rig):
+    r = rig()
+    r.control.words[Word.BEAT_NS] = 1
+    in_motion(r, 300)
+    assert r.until_done() is Result.DONE

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session, read_session
@@ -66,3 +67,14 @@ def test_nothing_is_left_running(tmp_path: Path) -> None:
     interrupted(tmp_path)
     listing = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
     assert not [line for line in listing.splitlines() if str(tmp_path) in line]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTSTP, signal.SIGQUIT])
+def test_ctrl_z_and_ctrl_backslash_stop_the_arm_and_suspend_or_kill_nobody(number: signal.Signals) -> None:
+    calls: list[str] = []
+    before = signal.getsignal(number)
+    with Interrupts(lambda: calls.append("stop"), lambda: calls.append("drop")):
+        assert callable(signal.getsignal(number))  # else the signal would suspend or end the tests
+        signal.raise_signal(number)
+    assert calls == ["stop"]
+    assert signal.getsignal(number) is before
