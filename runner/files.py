@@ -16,6 +16,7 @@ from fri.errors import ConfigurationError, DataError, LwrError, RefusedError
 from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
+from lwr_driver.arm.description import enforce_ceilings
 from lwr_driver.arm.load import check_load
 from lwr_driver.configuration import find
 from lwr_driver.places import Place
@@ -45,6 +46,7 @@ def gather(experiment: Experiment, rounds: int = 0) -> list[Reference]:
     beside = experiment.folder
     with noting() as found:
         arm = Arm.load(experiment.arm, beside=beside)
+        _check_ceilings(experiment, arm)
         _check_home(experiment, arm)
         Cell.load(experiment.cell, beside=beside)
         for payload in experiment.payloads().values():
@@ -59,6 +61,16 @@ def gather(experiment: Experiment, rounds: int = 0) -> list[Reference]:
         if experiment.backend == "emulator":
             _examine_emulator(experiment)
     return found
+
+
+def _check_ceilings(experiment: Experiment, arm: Arm) -> None:
+    """Raise ConfigurationError for a real arm with limits beyond the LWR4+'s, as its driver will."""
+    if experiment.backend != "fri":
+        return
+    try:
+        enforce_ceilings(arm)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{experiment.arm}: {error}") from error
 
 
 def _check_home(experiment: Experiment, arm: Arm) -> None:

@@ -30,6 +30,43 @@ def _causes(name: str, file: str, old: str, new: str) -> Bug:
 
 BUGS: tuple[Bug, ...] = (
     Bug(
+        "a payload is swapped on an arm in command mode",
+        "runner/experiment.py",
+        "            self._require_monitor_mode()\n",
+        "",
+        (f"{_SESSIONS}::test_an_arm_that_stays_in_command_mode_ends_the_run_before_anybody_is_sent_to_it",),
+    ),
+    Bug(
+        "command mode begins with other load data than announced",
+        "lwr_driver/driver.py",
+        "        self._check_load()\n        try:\n",
+        "        try:\n",
+        ("tests/lwr_driver/test_load.py::test_no_command_mode_with_other_load_data_than_announced",),
+    ),
+    Bug(
+        "a factor of zero counts as full speed",
+        "lwr_driver/guard.py",
+        "(min(factor, 1.0) if sound_factor(factor) else 0.0)",
+        "(factor if 0.0 < factor < 1.0 else 1.0)",
+        (f"{_GUARD}::test_nothing_moves_with_a_factor_that_no_controller_gives",),
+    ),
+    Bug(
+        "a motion goes on without anybody to stop it",
+        "lwr_driver/loop.py",
+        "silence > _NOBODY_S",
+        "silence > 1e9",
+        (
+            "tests/lwr_driver/test_loop.py::test_a_motion_stops_within_the_limits_when_the_driver_gives_no_sign_of_life",
+        ),
+    ),
+    Bug(
+        "a restart of the controller looks like one cycle",
+        "fri/remote.py",
+        "            tracker.skip(max(round(away), _RESTART_CYCLES) - 1)\n",
+        "",
+        ("tests/fri/test_remote.py::test_the_time_of_a_restart_is_a_gap_in_the_numbers",),
+    ),
+    Bug(
         "the preflight is not enforced",
         "runner/experiment.py",
         "        preflight.enforce()\n",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import subprocess
@@ -378,3 +379,10 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
 def test_unknown_quality_is_refused_with_the_known_ones(lab):
     with pytest.raises(ConfigurationError, match="UNACCEPTABLE, BAD, OK, PERFECT"):
         lab.driver.wait_quality("GOOD")
+
+
+def test_no_motion_with_a_factor_that_no_controller_gives(lab, monkeypatch):
+    motion, state = lab.hop(), lab.command().state()
+    monkeypatch.setattr(lab.driver, "state", lambda: dataclasses.replace(state, safety_limits=0.0))
+    with pytest.raises(RefusedError, match=r"safety_limits .* is 0, it must be above 0 and finite.*friStart"):
+        lab.driver.execute(motion)

@@ -173,3 +173,18 @@ def test_load_data_in_force_show_in_the_gravity_torques() -> None:
         LwrError, match=r"A3 in the controller changed by \+0.00 Nm, expected .* nothing moved"
     ):
         check_gravity_change(arm(), HOME, (before, before), (bare, (3.34, com)))
+
+
+def test_a_real_arm_of_another_name_keeps_the_limits_of_the_lwr4(file: Path) -> None:
+    lab = file.parent
+    text, urdf = (lab / "lwr4plus.yaml").read_text(), (lab / "lwr4plus.urdf").read_text()
+    for name in arm().joint_names:
+        text = text.replace(f"name: {name},", f"name: J{name},")
+        urdf = urdf.replace(f'<joint name="{name}"', f'<joint name="J{name}"')
+    text = text.replace("acceleration_rad_s2: 8.0", "acceleration_rad_s2: 20.0")
+    (lab / "lwr4plus.yaml").write_text(f"{text}\nmodel: my arm\n")
+    (lab / "lwr4plus.urdf").write_text(urdf)
+    assert examine(Experiment.load(file))  # as an emulated arm it may
+    real = experiment_file(lab, backend="fri", lock_step=False, emulator_settings={})
+    with pytest.raises(ConfigurationError, match=r"JA1: acceleration_rad_s2 20 rad/s² is beyond 8"):
+        examine(Experiment.load(real))
