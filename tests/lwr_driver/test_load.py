@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fri.errors import ConfigurationError, RefusedError, RobotError
+from lwr_driver.control import Job, Word
 from lwr_driver.driver import Driver, LinkSettings
 from runner.experiment_file import Payload
 from runner.laboratory import free_port
@@ -56,7 +57,8 @@ def test_no_command_mode_with_other_load_data_than_announced() -> None:
         driver.monitor(20)
         with pytest.raises(RefusedError, match=r"2 kg at \(0, 0, 100\) mm.*announced: none.*pendant"):
             driver.enter_command()
-        assert driver.state().state == "MON"
+        # It was not even asked for.
+        assert driver._need(driver._control).words[Word.JOB] == Job.CYCLES
         # Changed on the way to command mode: it is left again.
         emulator.pendant.set_load(0.0)
         driver.monitor(20)
