@@ -104,8 +104,8 @@ BUGS: tuple[Bug, ...] = (
     Bug(
         "a payload lost in motion is not noticed",
         "runner/experiment.py",
-        "outcome = self._still_loaded(plan, here, self._drive(plan, motion))",
-        "outcome = self._drive(plan, motion)",
+        "outcome, held = self._still_loaded(plan, here, self._drive(plan, motion))",
+        "outcome, held = self._drive(plan, motion), here",
         (f"{_SESSIONS}::test_a_payload_lost_on_the_way_fails_the_session",),
     ),
     Bug(

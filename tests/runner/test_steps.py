@@ -124,6 +124,8 @@ def test_hold_enters_and_leaves_command_mode_without_motion(day: Day, tmp_path: 
     assert "held the pose for 1 s in command mode" in str(step)
     assert day.bench.driver.state().state == "MON"
     session = read_session(path)
+    assert session.end is not None
+    assert session.end["restarts"] == "0"
     assert np.ptp(session.joint.position, axis=0).max() < 1e-3
     assert session.metadata["uid"]
     assert {"preflight.json", "plan.npz", "experiment.yaml"} <= set(session.attachments)

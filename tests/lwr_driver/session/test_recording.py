@@ -175,3 +175,10 @@ def test_one_motor_torque_that_is_not_finite_costs_its_own_sample_alone(tmp_path
     assert len(session.motor) == recorded.motor_samples == whole.motor_samples - 1
     assert recorded.motor_rejected == 1
     assert session.end["motor_rejected"] == "1"
+
+
+def test_restarts_of_the_controller_are_in_the_closing_record(tmp_path):
+    recording = Recording(SessionRequest(tmp_path / "a.mcap", JOINTS, METADATA), utc_offset=EPOCH)
+    recording.write(rows(10))
+    recording.close("success", "", restarts=2)
+    assert read_session(tmp_path / "a.mcap").end["restarts"] == "2"
