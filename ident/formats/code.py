@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fri.errors import ConfigurationError
+from ident.effects import parameter_values
 from ident.formats.newton_euler import FUNCTIONS, Expression, Graph, torques
 from ident.formats.standard import StandardModel
 from ident.formats.traced import torques_with_effects
@@ -266,7 +267,7 @@ def _head(program: Program) -> list[str]:
         f"Inverse dynamics of {model.title or 'a serial arm'}.",
         "Generated code: change the model, not this file.",
         f"Joints, base to tip: {' '.join(model.chain.joint_names)}. SI units: rad, rad/s, rad/s^2, Nm.",
-        *(f"{output}: {_MEANING[output]}" for output in program.outputs),
+        *(f"{output}: {_meaning(model, output)}" for output in program.outputs),
         f"{count['multiplications']} multiplications, {count['additions']} additions, "
         f"{count['functions']} functions.",
         f"Coulomb friction: {_COULOMB[model.coulomb_kind].format(model.coulomb_width)}.",
@@ -280,7 +281,28 @@ def _effects(program: Program) -> list[str]:
     """Lines on the effects of the model in the program, and on those that are not."""
     held = list(dict.fromkeys(str(entry["cause"]) for entry in program.carried))
     part = [f"With the model's effects: {', '.join(held)}."] if held else []
-    return [*part, *program.model.without(program.missing)]
+    return [*part, *program.model.without(program.missing), *sensor_errors(program.model)]
+
+
+def _meaning(model: StandardModel, output: str) -> str:
+    if output == "tau_joint" and model.sensors:
+        return "torque behind the gear, without the errors of the sensors that the model has."
+    return _MEANING[output]
+
+
+def sensor_errors(model: StandardModel, file: str = "this file") -> tuple[str, ...]:
+    """Note on the errors of the sensors, which are part of no torque of a program; none without any."""
+    if not model.sensors:
+        return ()
+    named = []
+    for entry in model.sensors:
+        joints = ", ".join(model.chain.joint_names[int(joint) - 1] for joint in entry["joints"])
+        values = ", ".join(f"{name} {value:.4g}" for name, value in parameter_values(entry).items())
+        named.append(f"{entry['cause']} ({': '.join(filter(None, (joints, values)))})")
+    return (
+        f"Torques in {file} are the true ones; a sensor shows them with its error: {'; '.join(named)}. "
+        "Python's `model.torque(..., measured=True)` has these errors.",
+    )
 
 
 def _comment(text: str) -> str:

@@ -1,11 +1,12 @@
 """Export to the XML descriptions URDF and MJCF, with all digits of the numbers.
 
 A URDF holds rigid bodies and, for each joint, `damping` and `friction`; read back, it gives the torques of the
-model. Drive inertias and torque offsets have no place in the format and go to a comment.
+model. Drive inertias, torque offsets, coupled drives and a gravity that does not point straight down have no place in
+the format and go to a comment.
 
 MJCF, the model format of MuJoCo, holds bodies, drive inertia as `armature`, `frictionloss` and `damping` of each
-joint. Body frames are the modified Denavit-Hartenberg frames of the chain; every joint has a motor. Torque offsets
-go to a comment.
+joint; coupled drives are fixed tendons with `armature`, which an old MuJoCo does not know. Body frames are the modified
+Denavit-Hartenberg frames of the chain; every joint has a motor. Torque offsets go to a comment.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ import numpy as np
 
 from fri.errors import ConfigurationError
 from ident.dynamics import parameters
+from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.urdf import read_urdf
-from ident.formats.standard import StandardModel
+from ident.formats.standard import CoupledDrives, StandardModel
 
 
 def friction(model: StandardModel) -> tuple[Floats, Floats, tuple[str, ...]]:
@@ -53,24 +55,120 @@ def digits(value: float) -> str:
     return repr(float(value) + 0.0)
 
 
-def comment(model: StandardModel, notes: tuple[str, ...]) -> str:
-    """Text of the comment at the head: parameters without a place in the format."""
-    names = model.chain.joint_names
+def comment(model: StandardModel, kind: str, notes: tuple[str, ...]) -> str:
+    """Text of the comment at the head: parameters without a place in the format, "URDF" or "MJCF"."""
+    names, both = model.chain.joint_names, len(model.sides) > 1
+    columns: list[tuple[str, Floats]] = []
+    if "motor" in model.sides and kind == "URDF":
+        columns.append(("drive inertia [kg m^2]", model.drive[:, 0]))
+    if "joint" in model.sides:
+        columns.append(("torque offset joint side [Nm]", model.drive[:, 3]))
+    if "motor" in model.sides:
+        columns.append(
+            ("torque offset motor side [Nm]", model.drive[:, 6] + (0 if both else model.drive[:, 3]))
+        )
     rows = [
         f" Inertials and friction identified: {model.title or 'a serial arm'}.",
-        "Damping and friction are those of both sides of the gear together.",
-        "Not part of a URDF, by joint: drive inertia [kg m^2], torque offset joint side, motor side [Nm]:",
+        "Damping and friction are those of both sides of the gear together."
+        if "motor" in model.sides
+        else "Damping and friction are those behind the gear alone.",
+        f"Not part of {_A[kind]}, by joint: {', '.join(name for name, _ in columns)}:",
     ]
     for k, joint in enumerate(names):
-        inertia, joint_offset, motor_offset = model.drive[k, [0, 3, 6]]
-        rows.append(f"  {joint}  {inertia:.6g}  {joint_offset:.6g}  {motor_offset:.6g}")
+        rows.append("  ".join([f"  {joint}", *(f"{values[k]:.6g}" for _, values in columns)]))
     if model.coulomb_kind != "sign":
         law = f"{model.coulomb_kind} with width {model.coulomb_width:g} rad/s"
         rows.append(
             f"The friction was estimated as a {law}; the simulator has a law of its own near zero speed."
         )
-    rows += [*model.notes, *model.without(model.effects), *notes]
+    rows += [
+        *model.notes,
+        *left_out(model, kind),
+        *motors_unknown(model),
+        *model.without(model.effects),
+        *notes,
+    ]
+    if kind == "MJCF" and model.couplings:
+        rows.append("Coupled drives are fixed tendons; their armature needs a MuJoCo that knows it.")
     return "\n     ".join(rows).replace("--", "- -") + " "
+
+
+_A = {"URDF": "a URDF", "MJCF": "an MJCF file"}
+
+
+def left_out(model: StandardModel, kind: str, file: str = "this file") -> tuple[str, ...]:
+    """Notes on what a file of a format, "URDF" or "MJCF", lacks of the model: gravity and coupled drives."""
+    notes = []
+    if kind == "URDF":
+        notes.append(_tilted(model, file))
+    for coupling in model.couplings:
+        a, b = (model.chain.joint_names[joint] for joint in coupling.joints)
+        own = {
+            "inertia": (coupling.inertia, "kg m^2", kind == "MJCF" and _shared(model, coupling) is not None),
+            "viscous friction": (coupling.viscous, "Nm s/rad", kind == "MJCF" and coupling.viscous >= 0.0),
+            "Coulomb friction": (coupling.coulomb, "Nm", kind == "MJCF" and coupling.coulomb >= 0.0),
+        }
+        missing = [
+            f"{name} {value:.4g} {unit}" for name, (value, unit, held) in own.items() if not held and value
+        ]
+        if missing:
+            notes.append(
+                f"Missing in {file}, the coupled drives of {a} and {b}: {', '.join(missing)}; the torques of both "
+                "joints differ from the model's by these. C and numpy code have them"
+                + (", and MJCF as far as it can." if kind == "URDF" else ".")
+            )
+    return tuple(filter(None, notes))
+
+
+def motors_unknown(model: StandardModel, file: str = "this file") -> tuple[str, ...]:
+    """Note on a file of a model without motor torques."""
+    if "motor" in model.sides:
+        return ()
+    return (
+        "The model is one of joint torques: drive inertia and motor friction are unknown, not zero, and missing in "
+        f"{file}; a model with motor torques has them.",
+    )
+
+
+_UPRIGHT = 1e-6
+
+
+def _tilted(model: StandardModel, file: str) -> str:
+    """Note on a file without gravity, for a base where it does not point straight down; otherwise ""."""
+    gravity = model.base_gravity
+    size = float(np.linalg.norm(gravity))
+    if size == 0.0:
+        return (
+            f"Gravity of the model is zero, for which {file} has no place: set it to zero in the simulator."
+        )
+    tilt = float(np.arctan2(np.hypot(gravity[0], gravity[1]), -gravity[2]))
+    if tilt <= _UPRIGHT:
+        return ""
+    vector = " ".join(f"{value:.6g}" for value in gravity + 0.0)
+    roll, pitch = (
+        np.arctan2(-gravity[1], -gravity[2]),
+        np.arctan2(gravity[0], np.hypot(gravity[1], gravity[2])),
+    )
+    return (
+        f"The base is tilted by {np.rad2deg(tilt):.3g} degrees, for which {file} has no place: give the simulator "
+        f"gravity [{vector}] m/s^2 in the axes of the base, or mount the base with "
+        f'rpy="{roll + 0.0:.6g} {pitch + 0.0:.6g} 0".'
+    )
+
+
+def _shared(model: StandardModel, coupling: CoupledDrives) -> tuple[float, float] | None:
+    """Inertia of a tendon and its coefficient at the second joint, that make the inertia of coupled drives.
+
+    A tendon of inertia w and coefficients 1 and c adds w, w c and w c^2; None if the joints have less than that.
+    """
+    first, second = (max(float(model.drive[joint, 0]), 0.0) for joint in coupling.joints)
+    inertia = coupling.inertia
+    if 0.0 <= inertia <= min(first, second):
+        return inertia, 1.0
+    if inertia**2 > first * second:
+        return None
+    factor = float(np.copysign(np.sqrt(second / first), inertia))
+    return inertia / factor, factor
 
 
 def drives_left_out(model: StandardModel, file: str) -> str:
@@ -96,14 +194,16 @@ def document(root: ElementTree.Element) -> str:
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-_SNAP_RAD = 1e-5
+_SAME_POSE = 1e-12
+_SAME_BASE = 1e-3
+"""Differences of poses: none but rounding; and of the first link's, that the rounding of right angles explains."""
 
 
 def to_urdf(model: StandardModel, *, name: str | None = None) -> str:
     """URDF text of a consistent model: the arm's own with new inertials, or a new one for a chain from a table.
 
-    Bodies fixed to a moving link are part of that link's parameters and lose their own inertial. Angles of joint
-    origins within 1e-5 of a multiple of pi/2 are written as that multiple, as in the chain.
+    Bodies fixed to a moving link are part of that link's parameters and lose their own inertial. Origins of joints
+    are those of the chain, which takes an angle of 1.5708 for a right one.
 
     Raises ConfigurationError for a physically inconsistent model: project it first.
     """
@@ -130,15 +230,19 @@ def _changed(model: StandardModel, name: str | None) -> str:
         element.insert(0, _inertial(body))
     damping, dry, notes = friction(model)
     order = {joint: k for k, joint in enumerate(chain.joint_names)}
+    origins = _origins(chain)
     for joint in root.findall("joint"):
-        _snap_origin(joint)
+        if joint.get("name") in origins:
+            for old in joint.findall("origin"):
+                joint.remove(old)
+            joint.insert(0, ElementTree.Element("origin", _origin(origins[joint.get("name", "")])))
         if joint.get("name") in order:
             k = order[joint.get("name", "")]
             for old in joint.findall("dynamics"):
                 joint.remove(old)
             tags = {"damping": digits(damping[k]), "friction": digits(dry[k])}
             joint.append(ElementTree.Element("dynamics", tags))
-    root.insert(0, ElementTree.Comment(comment(model, notes)))
+    root.insert(0, ElementTree.Comment(comment(model, "URDF", notes)))
     return document(root)
 
 
@@ -159,7 +263,7 @@ def _new(model: StandardModel, name: str) -> str:
     chain = model.chain
     root = ElementTree.Element("robot", {"name": name})
     damping, dry, notes = friction(model)
-    root.append(ElementTree.Comment(comment(model, notes)))
+    root.append(ElementTree.Comment(comment(model, "URDF", notes)))
     parent = "base_link"
     ElementTree.SubElement(root, "link", {"name": parent})
     for k, joint_name in enumerate(chain.joint_names):
@@ -199,22 +303,37 @@ def _origin(pose: Floats) -> dict[str, str]:
         roll, yaw = np.arctan2(r[2, 1], r[2, 2]), np.arctan2(r[1, 0], r[0, 0])
     else:
         roll, yaw = np.arctan2(-r[1, 2], r[1, 1]), 0.0
-    angles = " ".join(digits(_snapped(float(angle))) for angle in (roll, pitch, yaw))
+    angles = " ".join(digits(_tidy(float(angle))) for angle in (roll, pitch, yaw))
     return {"xyz": " ".join(map(digits, pose[:3, 3])), "rpy": angles}
 
 
-def _snap_origin(joint: ElementTree.Element) -> None:
-    origin = joint.find("origin")
-    if origin is None or origin.get("rpy") is None:
-        return
-    angles = [float(part) for part in origin.get("rpy", "").split()]
-    if angles != [_snapped(angle) for angle in angles]:
-        origin.set("rpy", " ".join(digits(_snapped(angle)) for angle in angles))
+def _origins(chain: Chain) -> dict[str, Floats]:
+    """Origins (4, 4) of the chain's joints where the file's own differ from the chain's kinematics."""
+    assert chain.urdf is not None
+    assert chain.link_placements is not None
+    tree = read_urdf(chain.urdf)
+    above = {joint.child: joint for joint in tree.joints}
+    found: dict[str, Floats] = {}
+    for k, name in enumerate(chain.joint_names):
+        joint = above[chain.link_names[k]]
+        step = chain.placement(k) @ chain.link_placements[k]
+        step = np.linalg.inv(chain.link_placements[k - 1]) @ step if k else chain.base_placement @ step
+        # Between a joint of the chain and the one before it may be others, which do not move.
+        before, parent, start = np.eye(4), joint.parent, chain.link_names[k - 1] if k else None
+        while parent != start and parent in above:
+            # A chain that begins above the root does so where the pose is right.
+            if start is None and np.abs(before @ joint.origin - step).max() < _SAME_BASE:
+                break
+            before, parent = above[parent].origin @ before, above[parent].parent
+        difference = np.abs(before @ joint.origin - step).max()
+        if difference > _SAME_POSE and (start is not None or difference < _SAME_BASE):
+            found[name] = np.linalg.inv(before) @ step
+    return found
 
 
-def _snapped(angle: float) -> float:
+def _tidy(angle: float) -> float:
     nearest = round(angle / (np.pi / 2)) * (np.pi / 2)
-    return nearest if abs(angle - nearest) <= _SNAP_RAD else angle
+    return nearest if abs(angle - nearest) <= _SAME_POSE else angle
 
 
 def to_mjcf(model: StandardModel, *, name: str = "arm") -> str:
@@ -227,14 +346,17 @@ def to_mjcf(model: StandardModel, *, name: str = "arm") -> str:
     chain = model.chain
     damping, dry, notes = friction(model)
     armature = np.maximum(model.drive[:, 0], 0.0)
+    for coupling in model.couplings:
+        (a, b), (inertia, factor) = coupling.joints, _shared(model, coupling) or (0.0, 0.0)
+        armature[[a, b]] -= inertia, inertia * factor**2
+    armature = np.maximum(armature, 0.0)
     for joint, inertia in zip(chain.joint_names, model.drive[:, 0], strict=True):
         if inertia < 0.0:
             notes += (f"drive inertia of {joint} was estimated as {inertia:.6g} and is written as 0",)
     root = ElementTree.Element("mujoco", {"model": name})
-    root.append(ElementTree.Comment(comment(model, notes)))
+    root.append(ElementTree.Comment(comment(model, "MJCF", notes)))
     ElementTree.SubElement(root, "compiler", {"angle": "radian", "autolimits": "true"})
-    gravity = chain.base_placement[:3, :3] @ chain.gravity
-    ElementTree.SubElement(root, "option", {"gravity": " ".join(map(digits, gravity))})
+    ElementTree.SubElement(root, "option", {"gravity": " ".join(map(digits, model.base_gravity))})
     parent = ElementTree.SubElement(ElementTree.SubElement(root, "worldbody"), "body", {"name": "base"})
     limits = _limits(chain.urdf)
     for k, joint in enumerate(chain.joint_names):
@@ -267,10 +389,32 @@ def to_mjcf(model: StandardModel, *, name: str = "arm") -> str:
             tags["range"] = limits[joint]
         ElementTree.SubElement(body, "joint", tags)
         parent = body
+    if model.couplings:
+        _tendons(ElementTree.SubElement(root, "tendon"), model)
     actuators = ElementTree.SubElement(root, "actuator")
     for joint in chain.joint_names:
         ElementTree.SubElement(actuators, "motor", {"name": f"{joint}_motor", "joint": joint, "gear": "1"})
     return document(root)
+
+
+def _tendons(parent: ElementTree.Element, model: StandardModel) -> None:
+    """Coupled drives as tendons over both joints: friction of the sum of speeds, and the shared inertia."""
+    for coupling in model.couplings:
+        joints = [model.chain.joint_names[joint] for joint in coupling.joints]
+        inertia, factor = _shared(model, coupling) or (0.0, 1.0)
+        tendons = {
+            "friction": (
+                1.0,
+                {"damping": max(coupling.viscous, 0.0), "frictionloss": max(coupling.coulomb, 0.0)},
+            ),
+            "inertia": (factor, {"armature": inertia}),
+        }
+        for kind, (second, values) in tendons.items():
+            tags = {"name": f"{joints[0]}_{joints[1]}_{kind}"}
+            tags |= {key: digits(value) for key, value in values.items()}
+            tendon = ElementTree.SubElement(parent, "fixed", tags)
+            for joint, coefficient in zip(joints, (1.0, second), strict=True):
+                ElementTree.SubElement(tendon, "joint", {"joint": joint, "coef": digits(coefficient)})
 
 
 def _limits(urdf: str | None) -> dict[str, str]:

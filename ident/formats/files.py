@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from fri.errors import ConfigurationError
-from ident.formats.code import Program, to_c, to_numpy
-from ident.formats.description import drives_left_out, to_mjcf, to_urdf
+from fri.errors import ConfigurationError, LwrError
+from ident.formats.code import Program, sensor_errors, to_c, to_numpy
+from ident.formats.description import drives_left_out, left_out, motors_unknown, to_mjcf, to_urdf
 from ident.formats.read_back import check_c, check_mjcf, check_numpy, check_urdf
 from ident.formats.standard import StandardModel, standard_model
 from ident.model.model_file import Model, as_model, write_checked
@@ -36,7 +36,7 @@ def export(
     Each file is read back and computed with before it takes its name; C is compiled where there is a compiler.
     Raises ConfigurationError for an unknown ending, payload or model, and for a file that exists or cannot be
     written; nothing is written unless all endings are known. Raises DataError for a file of other torques than
-    the model's.
+    the model's; the other files are written.
     """
     paths = []
     for output in outputs:
@@ -60,11 +60,16 @@ def export(
     if descriptions:
         bodies = standard_model(source, payload=payload, consistent=True)
         notes += bodies.without(bodies.effects, ", ".join(descriptions))
+        for kind, ending in (("URDF", ".urdf"), ("MJCF", ".xml")):
+            if own := [path.name for path in paths if path.suffix == ending]:
+                notes += left_out(bodies, kind, ", ".join(own))
+        notes += motors_unknown(bodies, ", ".join(descriptions))
         notes += [drives_left_out(bodies, path.name) for path in paths if path.suffix == ".urdf"]
     if programs and source.effects:
         program = Program.of(plain)
         carried = replace(source, effects=program.carried)
         notes += plain.without(program.missing, ", ".join(programs))
+        notes += sensor_errors(plain, ", ".join(programs))
     writers = {
         ".urdf": lambda: to_urdf(bodies),
         ".xml": lambda: to_mjcf(bodies, name=name),
@@ -77,6 +82,14 @@ def export(
         ".c": lambda text: notes.append(check_c(text, carried, payload, name)),
         ".py": lambda text: check_numpy(text, carried, payload),
     }
+    written, failed = [], []
     for path in paths:
-        write_checked(path, writers[path.suffix](), checks[path.suffix])
+        try:
+            write_checked(path, writers[path.suffix](), checks[path.suffix], keep_draft=False)
+            written.append(path.name)
+        except LwrError as error:
+            failed.append(error)
+    if failed:
+        others = f" (written: {', '.join(written)})" if written else ""
+        raise type(failed[0])("; ".join(map(str, failed)) + others) from failed[0]
     return replace(bodies, notes=(*bodies.notes, *filter(None, notes)))

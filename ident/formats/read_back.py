@@ -76,9 +76,10 @@ def check_c(text: str, model: DynamicModel, payload: str | None, name: str) -> s
 def check_urdf(text: str, model: StandardModel) -> None:
     """Raise DataError unless the URDF holds the chain, the rigid torques and the friction of the model."""
     chain = model.chain
-    gravity = chain.base_placement[:3, :3] @ chain.gravity
+    gravity = model.base_gravity
     try:
-        again = Chain.from_urdf(text, tip=chain.link_names[-1], gravity=gravity)
+        # Every digit as it stands: other software rounds no angles.
+        again = Chain.from_urdf(text, tip=chain.link_names[-1], gravity=gravity, snap_rad=0.0)
     except LwrError as error:
         raise DataError(str(error)) from error
     if again.joint_names == chain.joint_names:
@@ -101,7 +102,8 @@ def check_mjcf(text: str, model: StandardModel) -> None:
     """Raise DataError unless the MJCF holds the bodies, drives and friction of the model."""
     bodies = {body.get("name"): body for body in ElementTree.fromstring(text).iter("body")}
     damping, dry, _ = friction(model)
-    drives = {"armature": np.maximum(model.drive[:, 0], 0.0), "damping": damping, "frictionloss": dry}
+    drives = {"damping": damping, "frictionloss": dry}
+    inertia, order = np.zeros((model.chain.n, model.chain.n)), list(model.chain.joint_names)
     for k, link in enumerate(model.chain.link_names):
         body = bodies.get(link)
         inertial, joint = (None, None) if body is None else (body.find("inertial"), body.find("joint"))
@@ -115,6 +117,24 @@ def check_mjcf(text: str, model: StandardModel) -> None:
         _compare(link, from_com(_number(inertial, "mass"), com, tensor), model.inertial[k], _DESCRIPTION)
         for key, values in drives.items():
             _compare(f"{key} of {joint.get('name')}", np.array(_number(joint, key)), values[k], _CODE)
+        inertia[k, k] += _number(joint, "armature")
+    for tendon in ElementTree.fromstring(text).findall("tendon/fixed"):
+        row = np.zeros(model.chain.n)
+        for part in tendon.findall("joint"):
+            row[order.index(part.get("joint", ""))] = _number(part, "coef")
+        inertia += float(tendon.get("armature", "0")) * np.outer(row, row)
+    _compare("armature", inertia, _drive_inertia(model), _CODE)
+
+
+def _drive_inertia(model: StandardModel) -> Floats:
+    """(n, n) inertia of the drives, with that of the coupled ones where real drives can have it."""
+    own = np.maximum(model.drive[:, 0], 0.0)
+    matrix = np.diag(own)
+    for coupling in model.couplings:
+        a, b = coupling.joints
+        if coupling.inertia**2 <= own[a] * own[b]:
+            matrix[a, b] = matrix[b, a] = coupling.inertia
+    return matrix
 
 
 def _states(model: DynamicModel) -> tuple[Floats, Floats, Floats]:

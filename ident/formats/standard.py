@@ -18,7 +18,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats, from_com
 from ident.dynamics.physical import Projection, project, reference_bodies
 from ident.dynamics.structure import Side
-from ident.effects import PRESLIDING, in_force
+from ident.effects import PRESLIDING, find_effect, in_force
 from ident.model.dynamic_model import DynamicModel
 
 
@@ -41,6 +41,7 @@ class StandardModel:
     coulomb_kind, coulomb_width : the function for sign(qd).
     consistent : whether every link is physically consistent (needed for URDF and MJCF, not for code).
     title : one line for the head of a file.
+    sensors : entries of the sensors' errors, part of measured torques alone.
     effects : entries of a model's effects that add to its torques. loaded : whether the payload is mounted, or the
     model has none. bodies : (n, 10) as the effects see them.
     """
@@ -58,6 +59,7 @@ class StandardModel:
     effects: tuple[Mapping[str, Any], ...] = ()
     loaded: bool = True
     bodies: Floats = field(default_factory=lambda: np.zeros((0, 10)))
+    sensors: tuple[Mapping[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
         for name, width in (("inertial", 10), ("drive", 7)):
@@ -68,6 +70,11 @@ class StandardModel:
                 )
             values.setflags(write=False)
             object.__setattr__(self, name, values)
+
+    @property
+    def base_gravity(self) -> Floats:
+        """(3,) acceleration of gravity in the axes of the base, which is the root of the URDF [m/s^2]."""
+        return np.asarray(self.chain.base_placement[:3, :3] @ self.chain.gravity)
 
     def without(self, entries: Sequence[Mapping[str, Any]], file: str = "this file") -> tuple[str, ...]:
         """Notes on a file without some of the effects; none if it has all."""
@@ -109,7 +116,7 @@ class ConsistentParameters:
     def notes(self) -> tuple[str, ...]:
         """Notes for the exported file."""
         if self.projection.exact:
-            return ("Physically consistent bodies with exactly the identified torque.",)
+            return ("Physically consistent bodies; the torque of the bodies is exactly the identified one.",)
         order = np.argsort(-np.abs(self.projection.shift))
         moved = ", ".join(
             f"{self.names[k]} by {self.projection.shift[k]:+.1f} sigma"
@@ -160,6 +167,7 @@ def standard_model(
         title=title,
         notes=notes,
         effects=tuple(entry for entry in model.effects if any(in_force([entry]))),
+        sensors=tuple(entry for entry in model.effects if find_effect(str(entry["cause"])).side == "sensor"),
         bodies=model.inertial(payload),
         loaded=model.loaded(payload),
     )

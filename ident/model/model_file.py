@@ -119,10 +119,13 @@ def write_model(model: DynamicModel, path: str | Path) -> None:
     write_checked(path, model_text(model), lambda text: _check_read(model, text))
 
 
-def write_checked(path: str | Path, text: str, check: Callable[[str], object]) -> None:
+def write_checked(
+    path: str | Path, text: str, check: Callable[[str], object], *, keep_draft: bool = True
+) -> None:
     """Write `text` (UTF-8) to `path` in one step, after `check` of the text as read back from the disk.
 
     check : raises LwrError for a file of no use; an existing file then stays, the draft lies beside it.
+    keep_draft : whether the draft of such a file stays.
     """
     target = Path(path)
     draft = target.with_name(target.name + ".part")
@@ -136,8 +139,11 @@ def write_checked(path: str | Path, text: str, check: Callable[[str], object]) -
     try:
         check(again)
     except LwrError as error:
+        if not keep_draft:
+            draft.unlink(missing_ok=True)
+        place = f" (draft: {draft.name})" if keep_draft else ""
         raise DataError(
-            f"{target}: the file cannot be read back, so it was not put in place (draft: {draft.name}): {error}"
+            f"{target}: the file cannot be read back, so it was not put in place{place}: {error}"
         ) from error
     try:
         draft.replace(target)

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -242,11 +244,30 @@ def test_urdf_drops_bodies_that_are_part_of_an_identified_link() -> None:
 
 
 def test_urdf_writes_angles_given_with_few_digits_as_the_right_angles_they_mean() -> None:
-    rough = to_urdf(consistent_lwr()).replace("1.5707963267948966", "1.5708")
+    rough = to_urdf(consistent_lwr()).replace("1.5707963267949", "1.5708")
     chain = Chain.from_urdf(rough)
     exported = to_urdf(StandardModel(chain, consistent_lwr().inertial, np.zeros((7, 7))))
-    assert "1.5708 " not in exported
-    assert "1.5707963267948966" in exported
+    joints = [joint.find("origin") for joint in ElementTree.fromstring(exported).findall("joint")]
+    angles = " ".join("" if origin is None else origin.get("rpy", "") for origin in joints).split()
+    assert angles.count("1.5707963267948966") == 3
+    assert not any(angle.endswith("1.5708") for angle in angles)
+
+
+@pytest.mark.parametrize("axis", ["0 0 1", "0 1 0"])
+def test_urdf_has_the_kinematics_of_the_chain_however_its_angles_were_rounded(axis: str) -> None:
+    text = to_urdf(consistent_lwr()).replace("1.5707963267949", "1.5708")
+    text = text.replace('xyz="0 0 0.3105" rpy="0 0 0"', 'xyz="0 0 0.3105" rpy="3.1416 0 1.5708"')
+    assert "3.1416" in text
+    chain = Chain.from_urdf(text.replace('axis xyz="0 0 1"', f'axis xyz="{axis}"'))
+    model = StandardModel(chain, consistent_lwr().inertial, np.zeros((7, 7)))
+    reloaded = pin.buildModelFromXML(to_urdf(model))
+    data = reloaded.createData()
+    q, qd, qdd = states(7)
+    truth = expected(model, q, qd, qdd)["tau_joint"]
+    for row in range(len(q)):
+        np.testing.assert_allclose(
+            pin.rnea(reloaded, data, q[row], qd[row], qdd[row]), truth[row], rtol=0, atol=1e-9
+        )
 
 
 def test_impossible_bodies_are_not_exported() -> None:
@@ -309,3 +330,64 @@ def test_mjcf_gives_the_torques_in_mujoco(tmp_path: Path) -> None:
         data.qpos[:], data.qvel[:], data.qacc[:] = q[row], qd[row], qdd[row]
         mujoco.mj_inverse(loaded, data)
         np.testing.assert_allclose(data.qfrc_inverse + data.qfrc_constraint, smooth[row], atol=1e-9)
+
+
+def test_a_tilted_base_is_named_where_the_format_has_no_place_for_it() -> None:
+    upright = consistent_lwr()
+    chain = replace(upright.chain, gravity=np.array([0.5, -1.2, -9.7]))
+    model = StandardModel(chain, upright.inertial, upright.drive)
+    text = to_urdf(model)
+    assert "gravity [0.5 -1.2 -9.7] m/s^2 in the axes of the base" in text
+    assert "tilted" not in to_urdf(upright)
+    assert "tilted" not in to_mjcf(model)
+    found = re.search(r'mount the base with rpy="(\S+) (\S+) 0"', text)
+    assert found is not None
+    mounted = pin.rpy.rpyToMatrix(float(found[1]), float(found[2]), 0.0) @ chain.gravity
+    np.testing.assert_allclose(mounted, [0.0, 0.0, -np.linalg.norm(chain.gravity)], atol=1e-4)
+
+
+def coupled_lwr(inertia: float) -> StandardModel:
+    model = consistent_lwr()
+    return StandardModel(
+        model.chain, model.inertial, model.drive, (CoupledDrives((4, 5), inertia, 0.7, 1.1),)
+    )
+
+
+def test_coupled_drives_are_named_where_the_format_has_no_place_for_them() -> None:
+    model = coupled_lwr(0.1)
+    named = "the coupled drives of A4 and A5: inertia 0.1 kg m^2, viscous friction 0.7 Nm s/rad"
+    assert named in to_urdf(model)
+    assert "Missing in" not in to_mjcf(model)
+    impossible = to_mjcf(coupled_lwr(50.0))
+    assert (
+        "Missing in this file, the coupled drives of A4 and A5: inertia 50 kg m^2; the torques" in impossible
+    )
+
+
+@pytest.mark.parametrize("share", [0.5, 0.99, -0.5])
+def test_mjcf_has_coupled_drives_as_tendons(share: float) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    first, second = consistent_lwr().drive[[4, 5], 0]
+    model = coupled_lwr(share * float(np.sqrt(first * second)))
+    loaded = mujoco.MjModel.from_xml_string(to_mjcf(model))
+    data = mujoco.MjData(loaded)
+    q, qd, qdd = states(7)
+    truth = expected(model, q, qd, qdd)["tau_motor"]
+    _, _, fcl, offl, _, fcm, offm = model.drive.T
+    truth -= (fcl + fcm) * np.sign(qd) + offl + offm
+    truth[:, [4, 5]] -= 1.1 * np.sign(qd[:, 4] + qd[:, 5])[:, None]
+    for row in range(len(q)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[row], qd[row], qdd[row]
+        mujoco.mj_inverse(loaded, data)
+        np.testing.assert_allclose(data.qfrc_inverse + data.qfrc_constraint, truth[row], atol=1e-9)
+    np.testing.assert_allclose(loaded.tendon_frictionloss, [1.1, 0.0])
+
+
+def test_a_model_of_joint_torques_names_its_motors_as_unknown() -> None:
+    full = consistent_lwr()
+    model = StandardModel(full.chain, full.inertial, full.drive, sides=("joint",))
+    for text in (to_urdf(model), to_mjcf(model)):
+        assert "drive inertia and motor friction are unknown, not zero" in text
+        assert "by joint: torque offset joint side [Nm]:" in text
+    assert "unknown" not in to_urdf(full) + to_mjcf(full)
+    assert "Not part of an MJCF file, by joint: torque offset joint side [Nm], torque offset" in to_mjcf(full)

@@ -91,7 +91,9 @@ def test_essential_parameters_alone_make_the_shortest_code(estimated: Callable[.
 
 def test_urdf_of_a_true_model_reproduces_its_torques(truth_model: DynamicModel) -> None:
     found = standard_model(truth_model, payload="load", consistent=True)
-    assert found.notes == ("Physically consistent bodies with exactly the identified torque.",)
+    assert found.notes == (
+        "Physically consistent bodies; the torque of the bodies is exactly the identified one.",
+    )
     reloaded = pin.buildModelFromXML(to_urdf(found))
     data = reloaded.createData()
     q, qd, qdd = states(7)

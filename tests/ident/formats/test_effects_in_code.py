@@ -96,3 +96,14 @@ def test_a_wrong_payload_weighs_on_the_payload_alone(truth_model: DynamicModel) 
         np.abs(model.torque(*states(), payload="load") - truth_model.torque(*states(), payload="load")).max()
         > 0.1
     )
+
+
+def test_errors_of_sensors_are_named_beside_the_true_torque(
+    truth_model: DynamicModel, tmp_path: Path
+) -> None:
+    done = export(replace(truth_model, effects=(OF_A_SENSOR,)), tmp_path / "arm.py", tmp_path / "arm.c")
+    for text in ((tmp_path / "arm.py").read_text(), (tmp_path / "arm.c").read_text()):
+        assert "tau_joint: torque behind the gear, without the errors of the sensors" in text
+        assert "sensor_gain (E1: error 0.1)" in text
+        assert "measured=True" in text
+    assert any("Torques in arm.py, arm.c are the true ones" in note for note in done.notes)

@@ -99,7 +99,20 @@ def test_a_bad_export_leaves_no_file(
     monkeypatch.setattr(files, "to_numpy", wrong)
     with pytest.raises(DataError, match=r"arm\.py: the file cannot be read back"):
         export(truth_model, tmp_path / "arm.py")
-    assert not (tmp_path / "arm.py").exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_bad_export_costs_no_other(
+    truth_model: DynamicModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        files, "to_urdf", lambda model: to_urdf(model).replace("mass value=", "mass value='1' x=")
+    )
+    with pytest.raises(
+        DataError, match=r"arm\.urdf: the file cannot be read back.*\(written: arm.py, arm.xml\)"
+    ):
+        export(truth_model, tmp_path / "arm.py", tmp_path / "arm.urdf", tmp_path / "arm.xml")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["arm.py", "arm.xml"]
 
 
 def test_a_name_cannot_end_the_comment_of_the_code(
