@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
@@ -220,18 +220,25 @@ def of_comparison(found: Comparison, models: Sequence[Path], page: Path | None) 
     return Ending(level, sentence, numbers, (), _VERBOSE, next_step, found.pieces(), shown)
 
 
-def of_payload(found: PayloadEstimate, arm: Path, sessions: Sequence[Path], out: Path | None) -> Ending:
-    """The end of an estimate of a payload. arm : the model. out : the model written with the payload."""
+def of_payload(
+    found: PayloadEstimate, arm: Path, sessions: Sequence[Path], out: Path | None, known: Collection[str] = ()
+) -> Ending:
+    """The end of an estimate of a payload. arm : the model. out : the model written with the payload.
+
+    known : payloads of the model, which it is not given again.
+    """
     sure = not abs(found.mass_deviation) > 3.0
     sentence = f"Payload {found.payload} has {_spread(found.mass, found.mass_std)}."
-    com = ", ".join(f"{1e3 * c:z.1f} ± {1e3 * s:.1f}" for c, s in zip(found.com, found.com_std, strict=True))
     numbers = [
-        ("centre of mass", f"{com} mm"),
+        ("centre of mass", found.centre),
         ("mass", found.verdict),
         ("residual rms", f"up to {found.largest_residual}"),
     ]
     again = ["lwr-run payload", *(quote(str(path)) for path in (arm, *sessions)), "--out with_payload.yaml"]
     next_step = " ".join(again) if out is None else f"lwr-run export {quote(str(out))} arm.urdf"
+    if found.payload in known:
+        # The model holds its own estimate of it: one from other sessions is a check.
+        next_step = f"lwr-run export {quote(str(arm))} arm.urdf --payload {quote(found.payload)}"
     notes = [Verdict("note", text.removeprefix("WARNING: "), "", "look") for text in found.notes]
     level: Level = "good" if sure and not notes else "look"
     return Ending(level, sentence, numbers, notes, (), next_step, found.pieces(), [found.listing()])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -149,9 +150,14 @@ def announced(
         metadata["payload"] = name
         if mass:
             try:
-                metadata["payload_mass"] = str(float(mass))
+                value = float(mass)
             except ValueError:
-                raise ConfigurationError(f"--payload {text!r}: {mass!r} is no mass in kg") from None
+                value = math.nan
+            if not 0.0 < value < math.inf:
+                raise ConfigurationError(
+                    f"--payload {text!r}: {mass!r} is no mass in kg; give a positive number, or FILE=NAME without one"
+                )
+            metadata["payload_mass"] = str(value)
         corrected[places[0]] = dataclasses.replace(session, metadata=metadata)
     return corrected
 

@@ -151,11 +151,19 @@ class PayloadEstimate(Tabular):
         return rows_of(name=self.names, unit=self.units, value=values, std=std, consistent=bodies)
 
     @property
+    def centre(self) -> str:
+        """The centre of mass in mm with its standard deviations, to their first digit."""
+        shown = []
+        for c, s in zip(1e3 * self.com, 1e3 * self.com_std, strict=True):
+            digits = max(1, -math.floor(math.log10(s))) if 0.0 < s < math.inf else 1
+            shown.append(f"{c:z.{digits}f} ± {s:.{digits}f}")
+        return f"{', '.join(shown)} mm"
+
+    @property
     def _mass_and_com(self) -> list[str]:
-        com = ", ".join(f"{1e3 * c:.1f} ± {1e3 * s:.1f}" for c, s in zip(self.com, self.com_std, strict=True))
         return [
             f"  mass {self.mass:.4f} ± {self.mass_std:.4f} kg; {self.verdict}",
-            f"  centre of mass x, y, z: {com} mm",
+            f"  centre of mass x, y, z: {self.centre}",
         ]
 
     def __repr__(self) -> str:

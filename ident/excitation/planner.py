@@ -77,10 +77,10 @@ def plan(
     problem : a problem or the path of its file.
 
     Ctrl-C ends the search; the best motion found so far is polished, checked and returned. A motion outside a limit is
-    never returned.
+    never returned, and none before one within every limit is found.
 
     Raises ConfigurationError for a contradictory problem, RefusedError for a problem without a feasible motion (with
-    limit and excess), OperatorError for an interruption before the first motion.
+    limit and excess), OperatorError for an interruption before the first motion within them.
     """
     if isinstance(problem, (str, Path)):
         problem = PlanProblem.load(problem)
@@ -95,7 +95,15 @@ def plan(
     tracker = _Tracker(assembled.setup, problem.search, progress, interrupted)
     candidates = search_candidates(assembled.setup, problem.search, tracker)
     tracker.stage("polish", 1)
-    outcome = _first_that_passes(assembled, candidates, tracker.interrupted)
+    try:
+        outcome = _first_that_passes(assembled, candidates, tracker.interrupted)
+    except RefusedError as error:
+        if not tracker.interrupted:
+            raise
+        raise OperatorError(
+            f"interrupted before a motion within every limit was found, so none is kept; plan again and give it more "
+            f"time. The best so far: {error}"
+        ) from error
     result = _describe(assembled, outcome, tracker)
     tracker.advance(None)
     return result
@@ -183,7 +191,9 @@ def search_candidates(setup: Setup, search: Search, tracker: _Tracker) -> list[C
         ):
             found += candidates
     except KeyboardInterrupt:
-        kept = "no motion was found yet" if tracker.best is None else "the best motion so far is kept"
+        kept = "the best motion so far is taken"
+        if tracker.best is None or not tracker.best.feasible:
+            kept = "no motion within every limit was found yet"
         _log.warning("search interrupted; %s", kept)
         tracker.interrupted = True
         if tracker.best is not None:

@@ -166,7 +166,7 @@ def payload_command(
     if as_json:
         click.echo(to_json(found.to_dict()))
     else:
-        of_payload(found, model, sessions, out).tell()
+        of_payload(found, model, sessions, out, arm.structure.payloads).tell()
 
 
 @verb("export")

@@ -461,6 +461,7 @@ def test_settings_that_make_no_sense_are_refused(
     [
         (["--payload", "other.mcap=block"], "write FILE=NAME"),
         (["--payload", "loaded.mcap=block:heavy"], "'heavy' is no mass in kg"),
+        (["--payload", "loaded.mcap=block:-1"], "'-1' is no mass in kg; give a positive number"),
         (["--essential", *SETTINGS], "has `essential: null`; leave one out"),
         (["--settings", "none.yaml"], "file 'none.yaml' not found"),
     ],

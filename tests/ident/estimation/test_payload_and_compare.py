@@ -23,6 +23,7 @@ from ident.model.model_file import read_model, write_model
 from ident.rows.filters import SignalSettings
 from runner.cli import main
 from runner.commands.models import compare_command, export_command, payload_command, validate_command
+from runner.ending import of_payload
 from tests.ident.known_arm import LOAD
 
 PLAIN = SignalSettings(motor_delay_s=0.0)
@@ -55,6 +56,12 @@ def test_payload_of_a_perfectly_known_arm(truth_model: Any, loaded: Any) -> None
     assert "no covariance" in found.notes[0]
     assert "they agree" in found.verdict
     assert parameters.consistency(found.consistent)[0].consistent
+    sharp = replace(found, covariance=1e-4 * found.covariance)
+    assert all(float(part.split("±")[1].split()[0]) > 0.0 for part in sharp.centre.split(","))
+    named = of_payload(found, Path("arm.yaml"), [Path("load.mcap")], None)
+    assert named.next_step == "lwr-run payload arm.yaml load.mcap --out with_payload.yaml"
+    known = of_payload(found, Path("arm.yaml"), [Path("load.mcap")], None, [found.payload])
+    assert known.next_step == "lwr-run export arm.yaml arm.urdf --payload load"
 
 
 def test_uncertainty_of_the_arm_is_part_of_the_payloads(

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import coal
 import distributed
@@ -28,6 +29,7 @@ from ident.excitation import (
     not_dominated,
     plan,
     plan_pieces,
+    planner,
     table,
     table_row,
     trade_off,
@@ -175,6 +177,21 @@ def test_interruption_returns_the_best_so_far_and_says_so(brief: PlanProblem) ->
 
     with pytest.raises(OperatorError, match="before any motion was found"):
         plan(brief, at_once)
+
+
+def test_interruption_before_a_motion_within_the_limits_keeps_none_and_says_so(
+    brief: PlanProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> Any:
+        raise RefusedError("A4 is outside")
+
+    def interrupt(event: Progress) -> None:
+        if event.done == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(planner, "_first_that_passes", refuse)
+    with pytest.raises(OperatorError, match=r"none is kept; plan again.*A4 is outside"):
+        plan(brief, interrupt)
 
 
 def test_a_quick_polish_still_ends_inside_every_limit(problem: PlanProblem, solved: ExcitationPlan) -> None:

@@ -120,6 +120,9 @@ def test_a_payload_is_named_by_the_file_as_typed_or_as_imported(first: Result, l
         announced(logs, ["three.csv=block"], typed)
     with pytest.raises(ConfigurationError, match=r"with one of the files one\.mcap, two\.mcap"):
         announced(logs, ["two.csv=block"])
+    for mass in ("0", "-1", "nan", "inf"):
+        with pytest.raises(ConfigurationError, match="is no mass in kg; give a positive number"):
+            announced(logs, [f"two.mcap=block:{mass}"])
 
 
 def test_the_written_mapping_repeats_the_import(first: Result, lab: Path) -> None:
