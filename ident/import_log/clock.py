@@ -15,11 +15,14 @@ from ident.import_log.fields import Field
 from ident.import_log.mapping import TimeBase
 from ident.import_log.rates import ALIKE, compare
 from ident.import_log.tables import Floats
-from ident.import_log.units import RATES
+from ident.import_log.units import RATES, TURNS, close
 
 # Share of rows whose times go back, beyond which the order of the rows is in doubt.
 _STEPS_BACK = 0.001
 _SHORTEST_S, _LONGEST_S = 1e-4, 0.1
+# Longest step of a rate below 10 Hz, where the velocities say so, or a joint would turn faster than this on average
+# [rad/s] in the unit of a rate above.
+_SLOWEST_S, _FASTEST = 1.0, 20.0
 _UNIX_S = 1e9
 
 
@@ -62,7 +65,7 @@ class Clocks:
         if self._rate_hz is not None:
             return self._even(self._rate_hz, count, "as given")
         if (column := self._column(count)) is not None:
-            return self._read(column)
+            return self._read(column, angle, velocity)
         if velocity is not None:
             steps = compare(angle, velocity.values, np.arange(count, dtype=np.float64))
             period = (RATES["deg/s"] if unit == "deg" else 1.0) / max(steps.ratio, 1e-9)
@@ -76,12 +79,13 @@ class Clocks:
             f"{self._source}: no rising column of times; give the rate of the samples with --rate-hz"
         )
 
-    def seconds(self, count: int) -> Floats | None:
-        """Times (n,) [s] of `count` samples after the first, None without a column or a rate."""
+    def seconds(self, position: Field, velocity: Field) -> Floats | None:
+        """Times (n,) [s] of the samples after the first, None without a column or a rate."""
+        count = len(position.values)
         if self._rate_hz is not None:
             return np.arange(count) / self._rate_hz
         column = self._column(count)
-        unit = None if column is None else _unit(column.values[:, 0])
+        unit = None if column is None else _unit(column, position.values, velocity)
         return None if column is None or unit is None else _seconds(column, TimeBase(1, unit=unit))
 
     def _column(self, count: int) -> Field | None:
@@ -99,11 +103,11 @@ class Clocks:
         times = np.arange(count) / rate_hz
         return Clock(TimeBase(rate_hz=rate_hz), times, None, "", f"{rate_hz:g} Hz, {why}")
 
-    def _read(self, column: Field) -> Clock:
+    def _read(self, column: Field, angle: Floats, velocity: Field | None) -> Clock:
         """The times of a rising column. DataError if no unit makes a rate of them."""
         times = column.values[:, 0]
         step = _step(times)
-        unit = _unit(times)
+        unit = _unit(column, angle, velocity)
         if unit is None:
             raise DataError(
                 f"{self._source}: the times {column.shown} are {step:.4g} apart, in no unit a rate from 10 Hz to "
@@ -176,8 +180,28 @@ def _step(times: Floats) -> float:
     return float(times[-1] - times[0]) / (len(times) - 1)
 
 
-def _unit(times: Floats) -> Literal["s", "ms", "us", "ns"] | None:
-    """The unit in which the times (n,) are of a rate from 10 Hz to 10 kHz."""
+def _unit(column: Field, positions: Floats, velocity: Field | None) -> Literal["s", "ms", "us", "ns"] | None:
+    """The unit in which a column's times are of a rate from 10 Hz to 10 kHz, or of one from 1 Hz by the motion.
+
+    positions : (n, k), in any unit.
+    """
     units: tuple[Literal["s", "ms", "us", "ns"], ...] = ("s", "ms", "us", "ns")
-    step = _step(times)
-    return next((u for u in units if _SHORTEST_S <= step * TimeBase(1, unit=u).seconds < _LONGEST_S), None)
+    step = _step(column.values[:, 0])
+    sizes = {u: step * TimeBase(1, unit=u).seconds * (1.0 + 1e-9) for u in units}
+    usual = next((u for u, size in sizes.items() if _SHORTEST_S <= size < _LONGEST_S), None)
+    slow = next((u for u, size in sizes.items() if _LONGEST_S <= size < _SLOWEST_S), None)
+    if usual is None or slow is None:
+        return usual
+    times, rate = _seconds(column, TimeBase(1, unit=usual)), RATES["deg/s"]
+    if velocity is not None and len(velocity.values) == len(positions) and np.isfinite(velocity.values).all():
+        ratios = np.abs(compare(positions, velocity.values, times).by_channel)
+        ratio = float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else 0.0
+        for unit in (usual, slow):
+            factor = sizes[unit] / sizes[usual]
+            if ratio > 0.0 and any(
+                close(ratio * factor, one) for one in (1.0, rate, 1.0 / rate, RATES["rpm"])
+            ):
+                return unit
+    speed = np.sqrt(np.mean(np.diff(positions, axis=0) ** 2, axis=0)).max() / sizes[usual]
+    degrees = np.abs(positions).max() >= TURNS
+    return slow if speed > _FASTEST * (rate if degrees else 1.0) else usual

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +137,7 @@ def import_log(
     described, notes = _described(mapping, urdf, base, tip, beside)
     recording = Recording(source, mapping.delimiter, mapping.header, notes=notes)
     total, channels, turned, missing = _read(mapping, recording, rows)
+    channels, polled = _once_each(channels)
     joint = channels["position"]
     digest = hashlib.sha256(
         repr((sorted(recording.digests.values()), rows, mapping.joints)).encode()
@@ -202,7 +203,7 @@ def import_log(
         unwrapped=tuple(turned),
         left_out=tuple(missing),
         periods=periods,
-        notes=(*recording.notes, *_strange_rate(float(np.median(steps))), *_jumping(mapping, joint)),
+        notes=(*recording.notes, *polled, *_strange_rate(float(np.median(steps))), *_jumping(mapping, joint)),
         conversions=_conversions(mapping),
         digests=recording.digests,
     )
@@ -379,6 +380,10 @@ def _one(file: str | tuple[str, ...] | None) -> str | None:
     return file[0] if isinstance(file, tuple) else file
 
 
+# Least number of measurements for an even repetition, and least mean number of rows of each.
+_LEAST_POLLED, _LEAST_POLLS = 50, 1.2
+
+
 def _repeated(channels: Mapping[str, _Channel]) -> int:
     """Samples equal to the one before in every value of `/joint_states`."""
     once = [channels[name].values for name in _ONCE if name in channels]
@@ -388,6 +393,38 @@ def _repeated(channels: Mapping[str, _Channel]) -> int:
             block = values[some.start : some.stop + 1]
             alike[some] &= (block[1:] == block[:-1]).all(axis=1)
     return int(np.count_nonzero(alike))
+
+
+def _once_each(channels: dict[str, _Channel]) -> tuple[dict[str, _Channel], list[str]]:
+    """The channels without the rows of a recorder that evenly polls faster than the arm measures, and a note on it.
+
+    Rows repeat in every value of all channels, each once or several times and no more than the next whole number: an
+    arm at rest, or a recorder that falls behind, has longer runs, and keeps all rows.
+    """
+    joint = channels["position"]
+    alike = np.ones(len(joint.times) - 1, dtype=bool)
+    for one in channels.values():
+        if not np.array_equal(one.times, joint.times):
+            return channels, []
+        alike &= (one.values[1:] == one.values[:-1]).all(axis=1)
+    first = np.flatnonzero(np.append(True, ~alike))
+    lengths = np.diff(first)
+    if (
+        len(lengths) < _LEAST_POLLED
+        or lengths.mean() < _LEAST_POLLS
+        or lengths.max() > np.ceil(lengths.mean())
+    ):
+        return channels, []
+    rate = 1e9 / np.diff(joint.times).mean()
+    note = (
+        f"{len(joint.times) - len(first)} of {len(joint.times)} rows repeat the one before evenly: recorded at "
+        f"{rate:.3g} Hz from an arm that measures at {rate / lengths.mean():.3g} Hz; one row of each is taken"
+    )
+    once = {
+        name: replace(one, times=one.times[first], published=one.published[first], values=one.values[first])
+        for name, one in channels.items()
+    }
+    return once, [note]
 
 
 def _jumping(mapping: LogMapping, joint: _Channel) -> list[str]:

@@ -1,7 +1,8 @@
 """A mapping guessed from the names in a recording, the URDF, and the numbers themselves; for a person to confirm.
 
 Names give the quantities, the URDF the joints. Numbers decide units: dq/dt must be the velocity, positions of most
-joints must keep the limits of the URDF, and the median step of the times must lie between 0.1 ms and 0.1 s.
+joints must keep the limits of the URDF, and the mean step of the times must lie between 0.1 ms and 0.1 s, or 1 s where
+the motion says so.
 """
 
 from __future__ import annotations
@@ -358,7 +359,7 @@ class _Guesser:
         """Velocity over dq/dt in the recorded numbers, where it tells the unit of the positions; else None."""
         if len(velocity.values) != len(position.values) or not np.isfinite(velocity.values).all():
             return None
-        times = self.clocks.seconds(len(position.values))
+        times = self.clocks.seconds(position, velocity)
         if times is None:
             return None
         rates = compare(position.values, velocity.values, times)

@@ -21,7 +21,8 @@ _OFF, _SPREAD = 0.03, 0.25
 """Least deviation of that factor that is said if all joints agree, and their largest spread over it."""
 _SLACK = 0.05
 """Share of a joint's range by which positions may exceed it."""
-_TURNS = 4.0 * math.pi
+TURNS = 4.0 * math.pi
+"""Two turns [rad], beyond which no joint goes."""
 _WAY = 0.5
 """Least way of a joint in rad that speaks for rad: in deg it would be at rest."""
 
@@ -45,7 +46,7 @@ def excess(angle: Floats, limits: Floats) -> Floats:
 
 def beyond_limits(angle: Floats, limits: Floats) -> NDArray[np.bool_]:
     """Joints (k,) whose angles (n, k) [rad] leave their limits (k, 2), or go beyond two turns."""
-    return (excess(angle, limits) > 0.0) | (np.abs(angle).max(axis=0) >= _TURNS)
+    return (excess(angle, limits) > 0.0) | (np.abs(angle).max(axis=0) >= TURNS)
 
 
 def in_degrees(numbers: Floats, limits: Floats, out: NDArray[np.bool_]) -> bool:
@@ -57,10 +58,10 @@ def in_degrees(numbers: Floats, limits: Floats, out: NDArray[np.bool_]) -> bool:
     if not out.any():
         return False
     largest = float(np.abs(limits).max())
-    largest = largest * (1.0 + _SLACK) if math.isfinite(largest) else _TURNS
+    largest = largest * (1.0 + _SLACK) if math.isfinite(largest) else TURNS
     within = ~out & (np.ptp(numbers, axis=0) > _WAY)
     size = np.abs(numbers).max(axis=0)
-    return bool(size.max() > largest and (out.sum() > within.sum() or np.sum(size >= _TURNS) > 1))
+    return bool(size.max() > largest and (out.sum() > within.sum() or np.sum(size >= TURNS) > 1))
 
 
 def rate_unit(rates: Rates) -> tuple[str, float] | None:

@@ -49,7 +49,7 @@ from ident.rows.class_rows import (
     nested,
 )
 from ident.rows.content import Kept, Recall
-from ident.rows.data_quality import passed_band
+from ident.rows.data_quality import all_losses, passed_band
 from ident.rows.delay import DELAY_HZ
 from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass, median_step
 from ident.rows.prepare import prepare
@@ -80,6 +80,8 @@ _WORTH = 0.005
 _OTHER = 0.005
 # Latest choices: the same recordings are estimated several times.
 _MOST_CHOICES = 64
+# Least share of samples amiss that explains that no rows are left.
+_MANY = 0.1
 
 
 @dataclass(frozen=True)
@@ -311,13 +313,29 @@ class _Bench:
                         len(self.columns),
                     )
         if not found:
-            most = max(len(session.joint) for session in self.sessions)
-            raise DataError(
-                f"no interval of {1e3 * BIN_S:.0f} ms in sessions of up to {most} samples has all samples of a "
-                "torque: they are too short, or too many samples are lost by the counter or flagged; record longer "
-                "ones without losses, or import without the counter"
-            )
+            raise DataError(self._nothing_left())
         return found
+
+    def _nothing_left(self) -> str:
+        """Why no rows are left, with what to do."""
+        most = max(len(session.joint) for session in self.sessions)
+        said = f"no interval of {1e3 * BIN_S:.0f} ms in sessions of up to {most} samples has all samples of a torque"
+        worst = max(all_losses(self.sessions), key=lambda loss: loss.share)
+        count = worst.samples + worst.lost
+        if worst.share < _MANY:
+            return f"{said}: they are too short; record longer ones"
+        kinds = {"repeat the one before": worst.repeated, "are lost by the counter": worst.lost}
+        kind = max(
+            kinds | {"are older than their stamps": worst.stale},
+            key=lambda name: kinds.get(name, worst.stale),
+        )
+        amount = kinds.get(kind, worst.stale)
+        advice = {
+            "repeat the one before": "the recorder polls faster than the arm measures. Record at the arm's rate, or "
+            "remove the rows that repeat others and import again",
+            "are lost by the counter": "record without losses, or import without the counter if it counts otherwise",
+        }.get(kind, "record with the stamps of the arm's own clock")
+        return f"{said}: {100.0 * amount / count:.0f} % of the {count} samples of {worst.session} {kind}; {advice}"
 
     def _shared(self, speed: Floats, joint: int, settings: SignalSettings) -> Floats:
         """Speeds (m, k) of the drives that a joint shares with others, of the joints' (m, n)."""

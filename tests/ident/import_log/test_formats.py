@@ -206,6 +206,26 @@ def test_repeated_samples_are_kept_and_counted(tmp_path: Path) -> None:
     assert "5 samples (50 %) equal to the one before, kept as they are" in str(report)
 
 
+def test_rows_of_an_arm_polled_too_fast_are_taken_once(tmp_path: Path) -> None:
+    kept = np.repeat(np.arange(60.0), 2)
+    columns = dict.fromkeys(("qa", "qb", "ta", "tb"), kept)
+    times = np.arange(120) * 0.01
+    report, session = imported(tmp_path, write_csv(tmp_path, 120, t=times, **columns), mapping())
+    np.testing.assert_array_equal(session.joint.position[:, 0], np.arange(60.0))
+    np.testing.assert_allclose(session.joint.log_time * 1e-9, times[::2], atol=2e-9)
+    assert report.repeated == 0
+    assert "60 of 120 rows repeat the one before evenly: recorded at 100 Hz from an arm that" in str(report)
+
+
+def test_an_arm_at_rest_keeps_its_rows(tmp_path: Path) -> None:
+    still = np.concatenate([np.zeros(60), np.arange(60.0)])
+    columns = dict.fromkeys(("qa", "qb", "ta", "tb"), still)
+    report, session = imported(
+        tmp_path, write_csv(tmp_path, 120, t=np.arange(120) * 0.01, **columns), mapping()
+    )
+    assert (len(session.joint.position), report.repeated) == (120, 60)
+
+
 def test_equal_stamps_are_refused_with_advice_or_spread_on_request(tmp_path: Path) -> None:
     write_csv(tmp_path, 6, t=[0.0, 0.001, 0.001, 0.001, 0.002, 0.002])
     with pytest.raises(DataError, match="set `equal: spread` in `time` if the clock has coarse steps"):

@@ -120,6 +120,29 @@ def test_the_unit_of_time_follows_from_its_steps(
     assert (found.unit, found.zero) == (unit, "unix" if start else "start")
 
 
+@pytest.mark.parametrize(("step", "unit"), [(0.1, "s"), (0.4, "s"), (100.0, "ms")])
+@pytest.mark.parametrize("angle", [1.0, DEG])
+@pytest.mark.parametrize("with_velocity", [False, True])
+def test_a_slow_recording_has_the_unit_of_its_motion(
+    step: float, unit: str, angle: float, with_velocity: bool, arm: Path, tmp_path: Path
+) -> None:
+    times = np.arange(N) * step
+    at = times[:, None] * (1.0 if unit == "s" else 1e-3)
+    q, qd = 0.8 * np.sin(0.7 * at + PHASE), 0.56 * np.cos(0.7 * at + PHASE)
+    names = ["t", *columns("q{k}"), *(columns("dq{k}") if with_velocity else []), *columns("tau{k}")]
+    parts = [times, q * angle, *([qd * angle] if with_velocity else []), 9.0 * np.sin(q)]
+    guess = guess_mapping(write(tmp_path / "run.csv", names, *parts), arm)
+    assert guess.mapping.time.unit == unit
+    assert guess.mapping.position.unit == ("rad" if angle == 1.0 else "deg")
+
+
+def test_a_fast_recording_is_not_taken_for_a_slow_one(arm: Path, tmp_path: Path) -> None:
+    names = ["t", *columns("q{k}"), *columns("dq{k}"), *columns("tau{k}")]
+    fast = np.arange(len(T)) * 0.2
+    path = write(tmp_path / "run.csv", names, fast, Q, QD * (T[1] - T[0]) / 2e-4, TAU)
+    assert guess_mapping(path, arm).mapping.time.unit == "ms"
+
+
 def test_coarse_stamps_are_spread(arm: Path, tmp_path: Path) -> None:
     names = ["t", *columns("q{k}"), *columns("tau{k}")]
     path = write(tmp_path / "run.csv", names, np.floor(T * 100) / 100, Q, TAU)

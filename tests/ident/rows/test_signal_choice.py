@@ -57,7 +57,22 @@ def test_a_recording_with_holes_in_every_interval_is_refused_with_advice():
     joint = dataclasses.replace(
         session.joint, **{name: getattr(session.joint, name)[kept] for name in fields}
     )
-    with pytest.raises(DataError, match=r"lost by the counter.*record longer ones without losses"):
+    with pytest.raises(
+        DataError, match=r"20 % of the \d+ samples of .* are lost by the counter; record without losses"
+    ):
+        chosen(dataclasses.replace(session, joint=joint))
+
+
+def test_a_recording_polled_too_fast_is_refused_with_that_as_the_cause():
+    session = arm.session(motor=False, sensors=sensors())
+    seen = np.arange(len(session.joint)) // 5 * 5
+    fields = ("position", "velocity", "effort")
+    joint = dataclasses.replace(
+        session.joint,
+        **{name: getattr(session.joint, name)[seen] for name in fields if getattr(session.joint, name).size},
+    )
+    told = r"80 % of the \d+ samples of .* repeat the one before; the recorder polls faster than the arm measures"
+    with pytest.raises(DataError, match=told):
         chosen(dataclasses.replace(session, joint=joint))
 
 
