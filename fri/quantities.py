@@ -114,10 +114,16 @@ def described(meta: Meta) -> str:
     """A range in words: `0.5 to 60 s`, `above 0 to 14 kg`."""
     unit = "" if (extra := _extra(meta)["unit"]) in ("", "share") else f" {extra}"
     if meta.ge is not None and meta.ge == meta.le:
-        return f"{meta.ge:g}{unit}"
-    low = f"above {meta.gt:g}" if meta.gt is not None else f"{meta.ge:g}"
-    high = f"below {meta.lt:g}" if meta.lt is not None else f"{meta.le:g}"
+        return f"{_end(meta.ge)}{unit}"
+    low = f"above {_end(meta.gt)}" if meta.gt is not None else _end(meta.ge)
+    high = f"below {_end(meta.lt)}" if meta.lt is not None else _end(meta.le)
     return f"{low} to {high}{unit}"
+
+
+def _end(value: Any) -> str:
+    """An end of a range; a whole number without an exponent, which YAML may read as a text."""
+    whole = isinstance(value, int) or (float(value).is_integer() and abs(value) < 1e9)
+    return str(int(value)) if whole else f"{value:g}"
 
 
 def _extra(meta: Meta) -> dict[str, str]:

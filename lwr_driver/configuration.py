@@ -293,7 +293,20 @@ def _convert_scalar(hint: Any, value: Any, where: Place) -> Any:
         bool: "true or false",
         Path: "a path",
     }
-    raise ConfigurationError(f"{where}: expected {expected.get(hint, hint)}, found {_found(value)}")
+    raise ConfigurationError(
+        f"{where}: expected {expected.get(hint, hint)}, found {_found(value)}{_as_number(hint, value)}"
+    )
+
+
+def _as_number(hint: Any, value: Any) -> str:
+    """How to write a number that YAML reads as a text, such as 1e6, or as one with a fraction; "" for others."""
+    try:
+        number = float(value) if hint in (int, float) and not isinstance(value, bool) else math.nan
+    except (TypeError, ValueError, OverflowError):
+        return ""
+    if not math.isfinite(number) or abs(number) >= 2**53 or (hint is int and not number.is_integer()):
+        return ""
+    return f"; write {int(number)}" if number.is_integer() else f"; write {number!r}"
 
 
 def _plain(value: Any) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -105,6 +106,69 @@ class IdentifySettings:
             resonance_hz=self.resonance_hz,
             essential=self.essential,
         )
+
+
+_LEAST_BLOCKS, _LEAST_ROWS = 8, 10
+# Keys of a settings file whose values are judged by the sessions alone, by the word in the message.
+_LATE = {
+    "without": ("without",),
+    "couplings": ("couplings",),
+    "keep": ("essential", "keep"),
+    "drop": ("essential", "drop"),
+    "stiffness_nm_rad": ("signals", "stiffness_nm_rad"),
+}
+
+
+@contextmanager
+def of_file(settings: str | None) -> Iterator[None]:
+    """Errors of a settings file that show with the sessions, with file and line."""
+    try:
+        yield
+    except ConfigurationError as error:
+        message = str(error)
+        keys = next((keys for word, keys in _LATE.items() if message.startswith(f"`{word}`")), None)
+        if settings is None or keys is None:
+            raise
+        path = find(settings)
+        place = Place.of(path)
+        for key in keys:
+            place = place.line_of(key)
+        if str(place) == str(path):  # of an option of the command line
+            raise
+        raise type(error)(f"{place}: {message}") from error
+
+
+def check_spans(
+    sessions: Sequence[Session], wanted: IdentificationSettings, file: str | Path = "settings"
+) -> None:
+    """Raise ConfigurationError for times in a settings file that the sessions are too short for."""
+    durations = [session.duration_s for session in sessions]
+    longest, total, signals = max(durations), sum(durations), wanted.signals
+    checks = (
+        (
+            ("signals", "rate_hz"),
+            signals.rate_hz is not None and signals.rate_hz * longest < _LEAST_ROWS,
+            f"{signals.rate_hz} Hz makes fewer than {_LEAST_ROWS} rows of the longest session, {longest:.3g} s; "
+            "raise it",
+        ),
+        (
+            ("signals", "edge_s"),
+            signals.edge_s is not None and 2.0 * signals.edge_s >= longest,
+            f"{signals.edge_s} s at either end leave nothing of the longest session, {longest:.3g} s; lower it",
+        ),
+        (
+            ("covariance", "block_s"),
+            wanted.covariance.block_s is not None and wanted.covariance.block_s * _LEAST_BLOCKS > total,
+            f"{wanted.covariance.block_s} s is more than an eighth of all sessions, {total:.3g} s, and fewer than "
+            f"{_LEAST_BLOCKS} blocks tell no deviation; lower it to {total / _LEAST_BLOCKS:.2g} or less",
+        ),
+    )
+    for keys, wrong, said in checks:
+        if wrong:
+            place = Place.of(file)
+            for key in keys:
+                place = place.line_of(key)
+            raise ConfigurationError(f"{place}: `{keys[0]}`: `{keys[1]}`: {said}")
 
 
 def couplings(texts: Sequence[str]) -> tuple[Coupling, ...]:

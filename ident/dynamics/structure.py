@@ -165,7 +165,9 @@ class ModelStructure:
 
     def _joint(self, name: str) -> int:
         if name not in self.chain.joint_names:
-            raise ConfigurationError(f"joint {name!r} is not one of {', '.join(self.chain.joint_names)}")
+            raise ConfigurationError(
+                f"`couplings` names joint {name!r}, not one of {', '.join(self.chain.joint_names)}"
+            )
         return self.chain.joint_names.index(name)
 
     @property

@@ -166,10 +166,11 @@ def prepare(
     if not sensed:
         passages = [replace(p, joint_valid=np.zeros_like(p.joint_valid)) for p in passages]
     if not passages:
-        raise DataError(
-            f"{name}: no stretch is longer than the ends of the position filter, {2.0 * settings.edge:.2f} s; record a "
-            "longer motion or raise `cutoff_hz`"
-        )
+        said = f"the ends of the position filter, {2.0 * settings.edge:.2f} s"
+        remedy = "raise `cutoff_hz`" if settings.edge_s is None else "lower `edge_s`"
+        if settings.rate_hz is not None and 1.0 / settings.rate_hz > 2.0 * settings.edge:
+            said, remedy = f"the time between two rows, {1.0 / settings.rate_hz:.2f} s", "raise `rate_hz`"
+        raise DataError(f"{name}: no stretch is longer than {said}; record a longer motion or {remedy}")
     advised = advice(
         settings,
         excitation_hz=excitation,

@@ -140,9 +140,11 @@ def command(
     from runner.estimation import (
         IdentifySettings,
         announced,
+        check_spans,
         couplings,
         known_from,
         named_model,
+        of_file,
         recorded_couplings,
     )
 
@@ -164,19 +166,21 @@ def command(
     logs, tested = logs[: len(sessions)], logs[len(sessions) :]
     chain = session_chain(logs[0], urdf, base=base, tip=tip)
     wanted = known_from(logs, chain, wanted, model)
+    check_spans(logs, wanted, Path(settings or "settings"))
     mounting = None
     status.show("estimating the model")
-    if estimator == AUTO:
-        from ident.estimation.choose import choose
+    with of_file(settings):
+        if estimator == AUTO:
+            from ident.estimation.choose import choose
 
-        found = choose(logs, chain, wanted, tilt=tilt or None)
-    elif tilt:
-        from ident.estimation.mounting import find_mounting
+            found = choose(logs, chain, wanted, tilt=tilt or None)
+        elif tilt:
+            from ident.estimation.mounting import find_mounting
 
-        mounting = find_mounting(logs, chain, wanted)
-        found = mounting.identification
-    else:
-        found = identify(logs, chain, wanted)
+            mounting = find_mounting(logs, chain, wanted)
+            found = mounting.identification
+        else:
+            found = identify(logs, chain, wanted)
     result = named_model(
         found.essential_model if essential else found.model, logs[0].metadata.get("robot", "") or "arm"
     )

@@ -443,6 +443,19 @@ def test_options_of_an_estimator_change_its_estimate(workplace: Callable[[], Pat
         ({"signals": {"cutof_hz": 8.0}}, "unknown key `cutof_hz`; did you mean `cutoff_hz`?"),
         ({"signals": {"known_share": 1.5}}, "`signals`: `known_share`: 1.5 is outside 0 to 1"),
         ({"covariance": {"block_s": 0.0}}, "`covariance`: `block_s`: 0.0 s is outside above 0 to 100000 s"),
+        ({"covariance": {"draws": 2e6}}, "found the float 2000000.0; write 2000000"),
+        ({"covariance": {"draws": 2000000}}, "is outside 2 to 1000000"),
+        ({"covariance": {"draws": "1e3"}}, "write 1000"),
+        (
+            {"covariance": {"block_s": 900.0}},
+            "`covariance`: `block_s`: 900.0 s is more than an eighth of all",
+        ),
+        ({"signals": {"edge_s": 100.0}}, "`signals`: `edge_s`: 100.0 s at either end leave nothing"),
+        ({"signals": {"rate_hz": 0.001}}, "`signals`: `rate_hz`: 0.001 Hz makes fewer than 10 rows"),
+        ({"signals": {"stiffness_nm_rad": [1.0]}}, "`stiffness_nm_rad` has 1 values for 7 joints"),
+        ({"essential": {"keep": ["M99"]}}, "`keep` names 'M99', not a base parameter"),
+        ({"without": ["M99"]}, "`without` names 'M99', not a parameter"),
+        ({"couplings": [["A5", "A9"]]}, "`couplings` names joint 'A9', not one of"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(

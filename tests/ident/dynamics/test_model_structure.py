@@ -96,7 +96,7 @@ def test_the_wrist_of_the_tx40_is_coupled():
     for joint in (4, 5):
         assert np.array_equal(rows[joint, :, 1], qd[:, 4] + qd[:, 5])
         assert np.array_equal(rows[joint, :, 2], np.sign(qd[:, 4] + qd[:, 5]))
-    with pytest.raises(ConfigurationError, match="'A9' is not one of"):
+    with pytest.raises(ConfigurationError, match="`couplings` names joint 'A9', not one of"):
         ModelStructure(lwr(), 2, couplings=(Coupling(("A1", "A9")),))
 
 
