@@ -82,6 +82,11 @@ def find(name: str | Path, *, beside: Path | None = None) -> Path:
             raise ConfigurationError(
                 f"file {_shown(name)!r} cannot be looked for: {error.strerror}"
             ) from error
+    folder = next((place for place in places if place.is_dir()), None)
+    if folder is not None:
+        inside = sorted(path.name for path in folder.glob("*.yaml"))[:5]
+        named = f"name a file in it: {', '.join(inside)}" if inside else "name a file"
+        raise ConfigurationError(f"{_shown(name)} is a folder; {named}")
     tried = ", ".join(_shown(place, 4 * _LONGEST_SHOWN) for place in places)
     raise ConfigurationError(f"file {_shown(name)!r} not found; tried {tried}; {_near(wanted, places)}")
 

@@ -21,6 +21,7 @@ from runner.report.verdicts import Level, Verdict, estimate_lines, headline, ver
 from runner.terminal import verbosity
 
 if TYPE_CHECKING:  # a command imports its own alone
+    from ident.diagnosis.look_alikes import LookAlikes
     from ident.estimation.compare import Comparison
     from ident.estimation.payload import PayloadEstimate
     from ident.estimation.validate import Validation
@@ -153,10 +154,26 @@ def of_estimate(content: Mapping[str, Any], model: Path | None, tables: Sequence
     return Ending("look" if look else "good", sentence, numbers_of(content), look, advice, next_step, tables)
 
 
-def of_diagnosis(said: Statements, page: Path | None, folder: Path) -> Ending:
-    """The end of a diagnosis with results in `folder`."""
+def compared(pair: LookAlikes, joint_names: Sequence[str]) -> tuple[str, str]:
+    """Name and value of a line on two causes side by side."""
+    first, second = (
+        cause + (f" {' '.join(joint_names[joint - 1] for joint in joints)}" if joints else "")
+        for cause, joints in (pair.first, pair.second)
+    )
+    told = "told apart by these sessions" if pair.told_apart else "not told apart by these sessions"
+    return (
+        f"{first} or {second}",
+        f"{told}: overlap {pair.alike:.3f}, rest {pair.apart:.1f}, needed {pair.needed:.1f}",
+    )
+
+
+def of_diagnosis(
+    said: Statements, page: Path | None, folder: Path, asked: Sequence[tuple[str, str]] = ()
+) -> Ending:
+    """The end of a diagnosis with results in `folder`. asked : lines on the comparisons asked for."""
     shown = [line for line in said.lines if line.anchor != "limits"]
     numbers = [(line.subject, line.found) for line in shown if line.level == "good"]
+    numbers += asked
     look = [
         Verdict(line.subject, line.found, line.wanted, line.level) for line in shown if line.level != "good"
     ]
@@ -164,8 +181,13 @@ def of_diagnosis(said: Statements, page: Path | None, folder: Path) -> Ending:
     return Ending(said.level, f"{said.headline}.", numbers, look, said.answers, next_step, said.pieces())
 
 
-def of_validation(found: Validation, tables: Sequence[Piece], sessions: Sequence[Path]) -> Ending:
-    """The end of a test of a model. tables : of all that was computed."""
+def of_validation(
+    found: Validation,
+    tables: Sequence[Piece],
+    sessions: Sequence[Path],
+    asked: Sequence[tuple[str, str]] = (),
+) -> Ending:
+    """The end of a test of a model. tables : of all that was computed. asked : lines on further tests asked for."""
     worst = max(found.scores, key=lambda score: max(score.relative.values()))
     seen = " (seen by the estimate: no validation)" if worst.seen else " on held-out data"
     sentence = (
@@ -180,6 +202,7 @@ def of_validation(found: Validation, tables: Sequence[Piece], sessions: Sequence
             f"{joints.joint} {joints.side}, {100 * joints.relative:.1f} %, rms {joints.rms:.3f} {joints.unit}",
         ),
         ("compared with", ", ".join(dict.fromkeys(one.predictor for one in found.competitors)) or "nothing"),
+        *asked,
     ]
     look = [Verdict("not validated", f"{one}", "", "bad") for one in found.unscored]
     look += [Verdict("warning", text, "", "look") for text in found.warnings]

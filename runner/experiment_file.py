@@ -260,11 +260,15 @@ class Experiment:
 
     @classmethod
     def load(cls, name: str | Path = DEFAULT, *, beside: Path | None = None) -> Experiment:
-        """Read and check an experiment file. ConfigurationError with file, key, value and advice.
+        """Read and check an experiment file, or that of a laboratory's folder.
 
-        beside : folder for the files named in it, by default its own.
+        beside : folder for the files named in it, by default its own. ConfigurationError with file, key, value and
+        advice.
         """
-        path = find(name)
+        inside = Path(name, "experiment.yaml")
+        # A folder of results has one too: it is a record, not a laboratory.
+        laboratory = inside.is_file() and not Path(name, "progress.json").exists()
+        path = find(inside if laboratory else name)
         experiment = parse(cls, read_mapping(path), path)
         folder = path.parent if beside is None else beside
         vars(experiment).update(source=path, folder=folder, text=read_text(path))

@@ -9,6 +9,10 @@ import signal
 import sys
 from typing import Any
 
+# Ctrl-C at a terminal goes to all its processes. A child ends with its parent instead, from its first imports on.
+if "--follow-stdin" in sys.argv:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
 import click
 
 from fri.errors import ConfigurationError, LwrError

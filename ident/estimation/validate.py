@@ -191,7 +191,7 @@ def validate(
             if flag and not allow_seen:
                 raise DataError(
                     f"{session.path.name}: the model was fitted to this session or a copy of it, so predicting it "
-                    "proves nothing; give a session of another motion, or --allow-seen to see the fit anyway"
+                    "proves nothing; give a session of another motion (`lwr-run validate --allow-seen` shows the fit)"
                 )
             predict = predictor(model, mounted(model, session))
             settle([doubt for doubt in doubts if doubt.certain and doubt.session in ("", session.path.name)])

@@ -28,6 +28,8 @@ Course = Literal["step", "drift"]
 
 # Least number of days on either side of a change: one alone may be an outlier.
 _SIDE = 2
+LEAST_DAYS = 2 * _SIDE + 1
+"""Least number of days of which a change can be told."""
 # Least number of days of a drift: fewer are a step or outliers.
 _DRIFTING = 4
 # Weight of the usual scatter, in days.

@@ -89,7 +89,7 @@ def command(
     from runner.diagnosis import arm_data, asked, chain_of, study
     from runner.diagnosis.discriminating import offers_after_logs
     from runner.diagnosis.study import replaceable
-    from runner.ending import of_diagnosis
+    from runner.ending import compared, of_diagnosis
     from runner.estimation import known_arm, recorded_couplings
     from runner.replay import attached_experiment
     from runner.report.page import write_diagnosis_report
@@ -130,4 +130,5 @@ def command(
     if as_json:
         hold_json(content)
     else:
-        of_diagnosis(found.said, page, out).tell()
+        asked_for = [compared(pair, chain.joint_names) for pair in found.pairs if not pair.finding]
+        of_diagnosis(found.said, page, out, asked_for).tell()

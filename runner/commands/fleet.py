@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from runner.output import NEW_FOLDER, OUTPUT_FILE
 from runner.status import answer, next_step, write
 from runner.terminal import NAMED_FILE, PATH, GroupedCommand, hold_json, json_option, tell
+
+if TYPE_CHECKING:  # a command imports its own alone
+    from runner.fleet.trend import ArmTrend
 
 _STORE = click.option(
     "--store",
@@ -96,7 +100,8 @@ def batch_command(
     )
 
     def report(one: Progress) -> None:
-        write(f"{one.arm} {one.day} {one.what}{f': {one.error}' if one.error else ''}", stream=place)
+        day = "undated" if _undated(one.day) else one.day
+        write(f"{one.arm} {day} {one.what}{f': {one.error}' if one.error else ''}", stream=place)
 
     with _cluster(dask):
         order = Order(wanted, diagnose, reference_days, jobs)
@@ -163,11 +168,38 @@ def trend_command(arm: str | None, store: Path, out: Path | None, as_json: bool)
         raise DataError(f"{store} holds no results; make them with `lwr-run batch FOLDER... --store {store}`")
     if arm is not None:
         one = arm_trend(home.arm(arm), usual_scatter(home))
+        arms = [one]
         tell({"schema_version": 1, **one.to_dict()} if as_json else one, as_json)
         text = arm_html(one) if out is not None else ""
     else:
         fleet = fleet_trend(home)
+        arms = list(fleet.arms)
         tell({"schema_version": 1, **fleet.to_dict()} if as_json else fleet, as_json)
         text = fleet_html(fleet) if out is not None else ""
+    for line in doubts(arms):
+        write(line, stream=sys.stderr if as_json else sys.stdout)
     if out is not None:
         next_step(open_page(write_page(text, out)), sys.stderr if as_json else None)
+
+
+def doubts(arms: Sequence[ArmTrend]) -> list[str]:
+    """Lines on arms with too few days for any change, and on logs without a date."""
+    from ident.monitoring.changes import LEAST_DAYS
+
+    lines = []
+    for one in arms:
+        if len(one.days) < LEAST_DAYS:
+            days = f"{len(one.days)} day{'s' * (len(one.days) != 1)}"
+            lines.append(f"{one.arm}: {days}, too few to tell a change; {LEAST_DAYS} are needed")
+    undated = [one.arm for one in arms if any(map(_undated, one.days))]
+    if undated:
+        lines.append(
+            f"undated logs of {', '.join(undated)} count as 1970-01-01: put the date into their path, such as "
+            "2026-03-12/"
+        )
+    return lines
+
+
+def _undated(day: object) -> bool:
+    """Whether a day is that of a clock without a date."""
+    return str(day).startswith("1970-")

@@ -73,11 +73,13 @@ def validate_command(
     result = replace(result, competitors=competitor_scores(tested, logs, settings=signals, others=others))
     content: dict[str, Any] = result.to_dict()
     tables = result.pieces()
+    asked: list[tuple[str, str]] = []
     if forward:
         runs = [simulate_session(tested, log, settings=signals) for log in logs]
         content["forward"] = [run.to_dict() for run in runs]
         for run in runs:
             tables += ["", *run.pieces()]
+            asked.append(("simulated", f"{run.session}: torque error {100 * run.relative:.2f} %"))
     if cross:
         structure = tested.structure
         keys = ("model", "without", "couplings", "coulomb")
@@ -87,10 +89,14 @@ def validate_command(
         folds = cross_validate(logs, structure.chain, wanted)
         content["cross_validation"] = folds.to_dict()
         tables += ["", *folds.pieces()]
+        errors = [max(score.relative.values()) for score in folds.scores]
+        left = f", {len(folds.skipped)} skipped" if folds.skipped else ""
+        span = f"torque error {100 * min(errors):.2f} to {100 * max(errors):.2f} %" if errors else "no score"
+        asked.append(("left out in turn", f"{len(errors)} sessions{left}: {span}"))
     if as_json:
         click.echo(to_json(content))
     else:
-        of_validation(result, tables, sessions).tell()
+        of_validation(result, tables, sessions, asked).tell()
 
 
 @verb("compare")

@@ -166,3 +166,10 @@ def test_merged_keys_may_be_replaced(tmp_path: Path) -> None:
     content = read_yaml(path)
     assert content["c"] == {"x": 3, "y": 1}
     assert content["d"]["x"] == 4
+
+
+def test_a_folder_in_place_of_a_file_is_told_as_that(tmp_path: Path) -> None:
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab/arm.yaml").touch()
+    with pytest.raises(ConfigurationError, match=r"lab is a folder; name a file in it: arm\.yaml"):
+        find(tmp_path / "lab")

@@ -28,6 +28,7 @@ def test_a_laboratory_is_complete_and_its_files_are_its_own(
     assert (lab / "krl" / "lwr_identification.src").is_file()
     used = {file.path for file in examine(Experiment.load(lab / "experiment.yaml"))}
     assert {lab / "experiment.yaml", lab / "lwr4plus.yaml", lab / "cell.yaml"} <= used
+    assert Experiment.load(lab).source == lab / "experiment.yaml"
     monkeypatch.chdir(lab)
     code, text = lwr_run("check", "-v")
     assert code == 0, text
