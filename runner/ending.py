@@ -30,6 +30,8 @@ if TYPE_CHECKING:  # a command imports its own alone
     from lwr_driver.session.session import SessionSummary
     from runner.preflight import Preflight
 
+_SINGULAR = 1e12
+"""Condition number from which on rounding decides."""
 _AT_ONCE = 0.1
 """Path [mrad, mm] below which friction turns at once."""
 
@@ -115,7 +117,13 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         text = ", ".join(_spread(one["estimate"], one["std"]) for one in masses)
         found.append(("payload mass", text))
     elif "condition" in summary:
-        found.append(("condition number", f"{summary['condition']:.4g}"))
+        condition = summary["condition"]
+        text = (
+            f"{condition:.4g}"
+            if condition < _SINGULAR
+            else "infinite: the motion does not show all parameters"
+        )
+        found.append(("condition number", text))
     return found
 
 

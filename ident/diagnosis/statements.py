@@ -44,11 +44,13 @@ REPLAYED = (
 
 @dataclass(frozen=True)
 class Number:
-    """A number in a table. key : its place in diagnosis.json."""
+    """A number in a table. key : its place in the file. most : largest size shown on a page; of a larger number only
+    that it is larger."""
 
     value: float | None
     form: str = ".4g"
     key: str = ""
+    most: float = math.inf
 
     def __str__(self) -> str:
         return "–" if self.value is None or math.isnan(self.value) else format(self.value, self.form)

@@ -108,7 +108,7 @@ class Mounting:
     def __str__(self) -> str:
         degrees, std = np.rad2deg(self.tilt_rad), np.rad2deg(self.std)
         parts = [
-            f"{angle:.2f} ± {s:.2f} deg about [{', '.join(f'{x:.3g}' for x in axis)}]"
+            f"{angle:.2f} ± {s:.2f} deg about [{', '.join(f'{round(float(x), 3) + 0.0:g}' for x in axis)}]"
             for angle, s, axis in zip(degrees, std, self.axes, strict=True)
         ]
         size = float(np.linalg.norm(degrees))

@@ -21,6 +21,15 @@ from lwr_driver.notebook import subplots
 Value = TypeVar("Value", float, Floats)
 
 
+MOST_PERCENT = 1000.0
+"""Largest relative standard deviation worth its digits: the parameter is not told from zero."""
+
+
+def percent(value: float, form: str) -> str:
+    """A relative standard deviation as text; of a large one only that it is."""
+    return f"> {MOST_PERCENT:g}" if value > MOST_PERCENT else format(value, form)
+
+
 @dataclass(frozen=True)
 class Covariance:
     """Covariance (p, p) of the estimate, its assumption (`kind`) and the degrees of freedom of its intervals.
@@ -154,7 +163,7 @@ class Estimate(Tabular):
         for k in np.argsort(-rsd, kind="stable")[:5]:
             lines.append(
                 f"  {self.names[k]:<10}{self.values[k]:>11.4g} ± {self.std[k]:<9.2g} {self._units[k]:<9} "
-                f"RSD {rsd[k]:.1f} %"
+                f"RSD {percent(rsd[k], '.1f')} %"
             )
         return "\n".join(lines)
 
@@ -176,7 +185,7 @@ class Estimate(Tabular):
                 name,
                 f"{value:.5g}",
                 f"{std:.3g}",
-                f"{rsd:.2f}",
+                percent(rsd, ".2f"),
                 unit + (", from the prior" if name in self.prior_only else ""),
             )
             for name, value, std, rsd, unit in zip(

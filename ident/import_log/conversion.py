@@ -74,8 +74,9 @@ class ImportReport:
         jitter = "regular" if self.longest_s - self.shortest_s < 1e-6 else "kept as recorded"
         lost = [f"  holes     {self.holes} intervals longer than 1.75 periods: lost samples"]
         share = 100.0 * self.repeated / self.rows["/joint_states"]
+        percent = f"{share:.0f}" if share >= 10.0 else f"{share:.2g}"
         again = [
-            f"  repeated  {self.repeated} samples ({share:.2g} %) equal to the one before, kept as they are"
+            f"  repeated  {self.repeated} samples ({percent} %) equal to the one before, kept as they are"
         ]
         lines = [
             f"{self.robot}: {len(self.joints)} joints, {self.duration_s:.3f} s",

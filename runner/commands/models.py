@@ -92,7 +92,7 @@ def validate_command(
         errors = [max(score.relative.values()) for score in folds.scores]
         left = f", {len(folds.skipped)} skipped" if folds.skipped else ""
         span = f"torque error {100 * min(errors):.2f} to {100 * max(errors):.2f} %" if errors else "no score"
-        asked.append(("left out in turn", f"{len(errors)} sessions{left}: {span}"))
+        asked.append(("left out in turn", f"{len(errors)} session{'s' * (len(errors) != 1)}{left}: {span}"))
     if as_json:
         click.echo(to_json(content))
     else:

@@ -19,7 +19,7 @@ from runner.computer import versions
 from runner.file_names import MODEL, SUMMARY
 from runner.report.figure import Figure
 from runner.report.folder import ResultFolder
-from runner.report.markup import Cell, figure_html, paragraph, section, table
+from runner.report.markup import MOST_PERCENT, Cell, figure_html, paragraph, section, table
 from runner.report.page import page_html
 from runner.report.plot import Line, Mark, Panel, Points
 from runner.report.verdicts import Level, Verdict
@@ -120,7 +120,7 @@ def _verdict(comparison: Comparison, changed: Sequence[Difference]) -> tuple[Lev
 
 
 def _words(one: Difference) -> str:
-    size = f" ({one.percent:+.1f} %)" if math.isfinite(one.percent) else ""
+    size = f" ({one.percent:+.1f} %)" if abs(one.percent) <= MOST_PERCENT else ""
     return f"{one.first:.4g} to {one.second:.4g} {one.unit}{size}, {abs(one.z):.1f} standard deviations"
 
 
@@ -147,7 +147,7 @@ def _table(comparison: Comparison, sides: tuple[Side, Side]) -> str:
                 Number(one.second),
                 Number(one.second_std, ".2g"),
                 one.unit,
-                Number(one.percent if known else None, ".1f"),
+                Number(one.percent if known else None, ".1f", most=MOST_PERCENT),
                 Number(one.z, ".1f"),
                 "differs" if one.name in comparison.significant else "",
             ]

@@ -32,7 +32,7 @@ from runner.report.diagnosis_figures import (
 from runner.report.figure import Figure
 from runner.report.figures import pretty_unit
 from runner.report.folder import ResultFolder
-from runner.report.markup import Cell, figure_html, fold, paragraph, section, table
+from runner.report.markup import Cell, figure_html, fold, paragraph, section, table, with_code
 from runner.report.paper import joint_labels
 
 
@@ -185,7 +185,7 @@ def _beside(diagnosis: DiagnosisFolder, said: Comparison) -> str:
 
 def _part(diagnosis: DiagnosisFolder, said: Part) -> str:
     if said.anchor == "limits":
-        return f"<ul>{''.join(f'<li>{escape(capital(note))}.</li>' for note in said.sentences)}</ul>"
+        return f"<ul>{''.join(f'<li>{with_code(capital(note))}.</li>' for note in said.sentences)}</ul>"
     html = "".join(map(paragraph, said.sentences)) + (_table(said) if said.rows else "")
     if said.anchor == "deciding":
         html += paragraph(run_advice(None if diagnosis.experiment is None else diagnosis.experiment.name))

@@ -130,6 +130,8 @@ def _number(number: Number) -> str:
         return "--"
     if math.isinf(number.value):
         return r"$\infty$" if number.value > 0 else r"$-\infty$"
+    if abs(number.value) > number.most:
+        return rf"$>{number.most:g}$" if number.value > 0 else rf"$<-{number.most:g}$"
     text = format(number.value, number.form)
     if not text.strip("+-0."):
         text = text.lstrip("+-")

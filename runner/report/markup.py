@@ -12,6 +12,9 @@ from runner.report.figure import Figure
 from runner.report.interactive import chart_json, panel_chart
 from runner.report.plot import STYLES, Role
 
+MOST_PERCENT = 1000.0
+"""Largest percentage worth its digits: the number is not told from zero."""
+
 Cell = str | Number
 
 _NUMBER = " class=n"
@@ -24,6 +27,9 @@ def number_html(number: Number) -> str:
     if number.value is None or not math.isfinite(number.value):
         return "–" if number.value is None or math.isnan(number.value) else "∞"
     key = f" data-key='{escape(number.key, quote=True)}'" if number.key else ""
+    if abs(number.value) > number.most:
+        beyond = f"&lt; \N{MINUS SIGN}{number.most:g}" if number.value < 0.0 else f"&gt; {number.most:g}"
+        return f"<data value='{number.value!r}'{key}>{beyond}</data>"
     shown = format(number.value, number.form)
     if not shown.strip("+-0."):
         shown = shown.lstrip("+-")
@@ -132,6 +138,10 @@ def fold(title: str, *parts: str, is_open: bool = False) -> str:
 def paragraph(text: str, classes: str = "") -> str:
     """A paragraph of plain text, with code between backticks."""
     name = f" class='{classes}'" if classes else ""
+    return f"<p{name}>{with_code(text)}</p>"
+
+
+def with_code(text: str) -> str:
+    """Plain text as markup, with code between backticks."""
     parts = [escape(part) for part in text.split("`")]
-    marked = "".join(f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts))
-    return f"<p{name}>{marked}</p>"
+    return "".join(f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts))

@@ -21,6 +21,7 @@ from runner.report.figures import (
 )
 from runner.report.folder import ResultFolder
 from runner.report.markup import (
+    MOST_PERCENT,
     Cell,
     chart_html,
     conditions_table,
@@ -403,7 +404,12 @@ def provenance_section(results: ResultFolder) -> str:
 
 def _numbers(entry: Mapping[str, Any], forms: Mapping[str, str], key: str = "") -> list[Number]:
     """Values of an entry. key : place of the entry in summary.json."""
-    return [Number(entry[what], form, key and f"{key}.{what}") for what, form in forms.items()]
+    return [
+        Number(
+            entry[what], form, key and f"{key}.{what}", MOST_PERCENT if what == "rsd_percent" else math.inf
+        )
+        for what, form in forms.items()
+    ]
 
 
 def _micro(seconds: float | None) -> Cell:

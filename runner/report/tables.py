@@ -12,7 +12,7 @@ from ident.diagnosis.statements import Number
 from runner.published import REBUILT, TABLE_1, TABLE_2, PredictedMotion, planned, rebuilt
 from runner.report.figures import interval_95, pretty_unit
 from runner.report.folder import ResultFolder
-from runner.report.markup import Cell
+from runner.report.markup import MOST_PERCENT, Cell
 
 _WORDS: dict[bool | None, str] = {True: "yes", False: "no", None: "–"}
 _OBJECTIVES = {
@@ -121,7 +121,7 @@ def table_2(results: ResultFolder) -> Table:
                 printed.name + mark,
                 pretty_unit(entry["unit"]) if entry else "",
                 Number(entry["estimate"] if entry else None, ".4f", f"{key}.estimate"),
-                Number(entry["rsd_percent"] if entry else None, ".2f", f"{key}.rsd_percent"),
+                Number(entry["rsd_percent"] if entry else None, ".2f", f"{key}.rsd_percent", MOST_PERCENT),
                 Number(printed.estimate, ".2f"),
                 Number(printed.rsd_percent, ".2f"),
                 Number(100 * (entry["estimate"] / printed.estimate - 1) if entry else None, "+.1f"),
@@ -146,7 +146,7 @@ def parameters(results: ResultFolder) -> Table:
                 Number(entry["estimate"], ".5g", f"{key}.estimate"),
                 Number(entry["std"], ".3g", f"{key}.std"),
                 *(Number(bound, ".5g") for bound in interval_95(entry)),
-                Number(entry["rsd_percent"], ".2f", f"{key}.rsd_percent"),
+                Number(entry["rsd_percent"], ".2f", f"{key}.rsd_percent", MOST_PERCENT),
                 *([Number(entry.get("truth"), ".5g", f"{key}.truth")] if truth else []),
             ]
         )

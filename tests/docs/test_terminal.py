@@ -570,7 +570,7 @@ def test_options_of_commands_for_models(workplace: Callable[[], Path]) -> None:
     assert {"forward", "cross_validation"} <= set(json.loads(text))
     said = run("validate", "model.yaml", *sessions, "--forward", "--cross")[1]
     assert re.search(r"simulated +loaded\.mcap: torque error \d+\.\d\d %", said)
-    assert re.search(r"left out in turn +2 sessions: torque error", said)
+    assert re.search(r"left out in turn +\d sessions?[^:]*: torque error \d", said)
     (place / "slow.yaml").write_text("signals: {cutoff_hz: 3}\n")
     code, slow = run("validate", "model.yaml", *sessions, "--settings", "slow.yaml", "--json")
     assert code == 0, slow

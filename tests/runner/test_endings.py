@@ -127,3 +127,8 @@ def test_few_days_and_days_without_a_date_are_no_sign_of_health() -> None:
         "undated logs of one count as 1970-01-01: put the date into their path, such as 2026-03-12/",
     ]
     assert doubts(arms[1:]) == []
+
+
+@pytest.mark.parametrize(("condition", "told"), [(68.8, "68.8"), (5.405e18, "infinite: the motion does not")])
+def test_a_condition_number_of_rounding_is_told_as_infinite(condition: float, told: str) -> None:
+    assert dict(numbers_of({"sessions": [], "condition": condition}))["condition number"].startswith(told)

@@ -73,6 +73,9 @@ def leaning(about_x: float, about_y: float) -> np.ndarray:
 def test_a_lean_of_the_base_is_found_with_its_sign(angles: tuple[float, float]) -> None:
     truth = leaning(*angles)
     found = find_mounting([recorded(truth, seed=4)], upright(), MODEL_1)
+    skewed = dataclasses.replace(found, axes=np.array([[1.0, -2.03e-23, 1e-9], [-1e-17, 1.0, 0.0]]))
+    assert "about [1, 0, 0]" in str(skewed)
+    assert "about [0, 1, 0]" in str(skewed)
     assert found.converged
     np.testing.assert_allclose(found.tilt_rad, angles, atol=1.5e-3)
     assert np.all(np.abs(found.tilt_rad - angles) < 4.0 * found.std)

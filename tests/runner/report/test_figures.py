@@ -10,6 +10,7 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,11 +19,21 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from fri.errors import ConfigurationError
-from ident.diagnosis.statements import Number
+from ident.diagnosis.statements import Number, Part
+from ident.estimators.estimate import percent
+from runner.report.diagnosis import _part
 from runner.report.figure import Figure, MatrixFigure, inline_svg
 from runner.report.interactive import chart_json, lighter_charts, panel_chart, zipped
 from runner.report.latex import tabular
-from runner.report.markup import figure_html, number_html, paragraph, table, take_charts
+from runner.report.markup import (
+    MOST_PERCENT,
+    figure_html,
+    number_html,
+    paragraph,
+    table,
+    take_charts,
+    with_code,
+)
 from runner.report.paper import FONTS, WIDTHS_MM, draw_panels, joint_labels
 from runner.report.plot import Band, Line, Panel, Points, thin
 from runner.report.tables import Table
@@ -269,6 +280,22 @@ def test_numbers_are_shown_as_a_person_writes_them(number: Number, shown: str) -
 def test_a_number_keeps_all_its_digits_in_the_markup() -> None:
     assert "value='0.1234567890123'" in number_html(Number(0.1234567890123, ".2f", "a.b"))
     assert "data-key='a.b'" in number_html(Number(0.1, ".2f", "a.b"))
+
+
+def test_a_percentage_of_nothing_is_not_shown_in_all_its_digits() -> None:
+    html = number_html(Number(2.84e15, ".2f", "rsd", MOST_PERCENT))
+    assert html == "<data value='2840000000000000.0' data-key='rsd'>&gt; 1000</data>"
+    assert "&lt; \N{MINUS SIGN}1000<" in number_html(Number(-3e12, ".1f", most=MOST_PERCENT))
+    assert ">999.0<" in number_html(Number(999.0, ".1f", most=MOST_PERCENT))
+    assert percent(2.84e15, ".2f") == "> 1000"
+    assert percent(12.25, ".2f") == "12.25"
+
+
+def test_code_between_backticks_is_marked_in_lists_too() -> None:
+    assert with_code("run `lwr-run <x>`") == "run <code>lwr-run &lt;x&gt;</code>"
+    folder: Any = None
+    html = _part(folder, Part("limits", "Limits", ["without a reference; run `lwr-run commission`"]))
+    assert html == "<ul><li>Without a reference; run <code>lwr-run commission</code>.</li></ul>"
 
 
 def test_text_cannot_become_markup() -> None:
