@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -187,6 +187,11 @@ def _follows(trial: Trial, other: Trial) -> bool:
     )
 
 
+def _power(torque: Mapping[Key, Floats]) -> float:
+    """Sum of squares of a torque."""
+    return sum(float(np.sum(np.square(part))) for part in torque.values())
+
+
 def _gain(trial: Trial) -> float:
     """Gain for the order of candidates, with a penalty for freedom."""
     return trial.score.gain - 2.0 * trial.shape.freedom
@@ -315,6 +320,15 @@ class State:
                 return True
         return False
 
+    def _tolerable(self, trial: Trial) -> bool:
+        """Whether a trial is no larger than its own tolerated deviation may be: beside the others it was beyond."""
+        for one in self.tolerated():
+            if one.of == trial.candidate.key and one.rows.keys() == trial.rows.keys():
+                largest = _power({key: columns * (one.size / one.unit) for key, columns in one.rows.items()})
+                torque = {key: columns @ trial.score.coefficients for key, columns in trial.rows.items()}
+                return 0.0 < _power(torque) <= largest < np.inf
+        return False
+
     def _by_habits(self, trial: Trial) -> bool:
         """Whether a trial is more than on a healthy arm only beside habits in its rows: the healthy sets were without
         them, and columns of friction share it among them."""
@@ -390,7 +404,12 @@ class State:
         least = self.null.least(trial.candidate, score)
         if score.gain <= least:
             return False
-        if healthy and (not self.null.exceeded(trial) or self._by_habits(trial) or self._of_own_law(trial)):
+        if healthy and (
+            not self.null.exceeded(trial)
+            or self._tolerable(trial)
+            or self._by_habits(trial)
+            or self._of_own_law(trial)
+        ):
             return False
         if trial.candidate.effect.seen_in_samples(trial.shape):
             return True

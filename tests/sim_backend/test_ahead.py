@@ -250,6 +250,7 @@ CASES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_many_cycles_at_once_are_the_single_cycles(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -107,11 +107,12 @@ class Own:
         self.client.cycles(60)
 
     def ask(self, load: list[float]) -> bool:
-        msr = np.zeros((), [("krl_int", "<i4", 16)])
-        msr["krl_int"] = self.cabinet.session.to_int
+        msr = np.zeros((), [("krl_int", "<i4", 16), ("krl_real", "<f4", 16)])
+        session = self.cabinet.session
+        msr["krl_int"], msr["krl_real"] = session.to_int, session.to_real
         self.handshake.request_load(self.client.command, msr, np.array(load))
         self.client.cycles(30)
-        msr["krl_int"] = self.cabinet.session.to_int
+        msr["krl_int"], msr["krl_real"] = session.to_int, session.to_real
         return self.handshake.load_taken(self.client.command, msr)
 
 

@@ -58,6 +58,7 @@ def pair(make: Make) -> list[Session]:
     return [make("a.mcap", 1), make("b.mcap", 2, None, 1)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["motor", "joint"])
 @pytest.mark.parametrize(
     ("edit", "joints", "words"),

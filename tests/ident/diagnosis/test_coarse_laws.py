@@ -33,6 +33,7 @@ def test_what_a_hose_of_another_form_leaves_is_no_second_cause(make: Make, chain
     assert 3 in {u.joint for u in found.unexplained}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("joint", "named"), [(2, {2}), (3, {2, 3})], ids=["its own rows", "others"])
 def test_what_the_least_error_of_a_strong_law_explains_is_no_second_cause(
     make: Make, chain: Chain, joint: int, named: set[int]

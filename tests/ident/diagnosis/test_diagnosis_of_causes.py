@@ -209,6 +209,7 @@ def test_what_shows_faintly_is_unsure_and_named_only_where_held_out_sessions_bea
     assert diagnose(fitted, chain, test=without_it, reference=reference).claims == ()
 
 
+@pytest.mark.slow
 def test_reference_knows_how_late_a_channel_is(make: Make, chain: Chain, reference: Reference) -> None:
     def late(s: Signals) -> None:
         s["joint"][:] = np.column_stack([np.interp(s["time"] - 0.0013, s["time"], c) for c in s["joint"].T])
@@ -323,6 +324,7 @@ def test_zero_that_drifts_steadily_is_told_by_its_rate(
     assert drift.std < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("undone", [False, True])
 def test_zero_that_jumps_within_a_session_is_told_with_its_moment(
     make: Make, chain: Chain, reference: Reference, undone: bool

@@ -166,6 +166,7 @@ def test_a_reference_with_the_friction_of_its_drives_at_the_links_is_made_anew(
         Reference.of(model)
 
 
+@pytest.mark.slow
 def test_torques_well_before_the_positions_are_no_late_channel(
     make: Make, chain: Chain, reference: Reference
 ) -> None:
@@ -179,6 +180,7 @@ def test_torques_well_before_the_positions_are_no_late_channel(
     assert all(one.side != "timing" for one in diagnose(bare, chain, reference=reference).findings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cycles", [1.0, 1.5, 2.0])
 def test_a_wave_of_the_angle_is_no_sure_spring(
     make: Make, chain: Chain, reference: Reference, cycles: float

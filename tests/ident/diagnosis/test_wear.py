@@ -16,6 +16,8 @@ from ident.dynamics.kinematics import Chain
 from lwr_driver.session import Session
 from tests.ident.diagnosis.changes import Make, Signals, pair
 
+pytestmark = pytest.mark.slow
+
 
 def friction(share: float, joint: int = 1) -> Callable[[Signals], None]:
     """More friction in the motor torque of a joint of the known arm."""
@@ -92,7 +94,6 @@ def test_a_law_that_shares_the_friction_with_the_healthy_one_is_no_wear_beside_i
     assert not worn(found)
 
 
-@pytest.mark.slow
 def test_a_torque_of_no_name_bends_the_parameters_and_is_no_wear(
     make: Make, chain: Chain, reference: Reference
 ) -> None:
@@ -124,7 +125,6 @@ def test_wear_is_no_part_of_the_extension(of_worn_arm: Diagnosis) -> None:
     assert all(entry["cause"] != "wear" for entry in found.extended_model.effects)
 
 
-@pytest.mark.slow
 def test_an_arm_that_changes_from_day_to_day_has_to_change_more_to_be_worn(make: Make, chain: Chain) -> None:
     restless = commission(
         [
@@ -240,7 +240,6 @@ def bent(share: float) -> Callable[[Signals], None]:
     return change
 
 
-@pytest.mark.slow
 def test_wear_of_a_drive_with_a_law_of_its_own_is_a_share_of_its_whole_friction(
     make: Make, chain: Chain
 ) -> None:

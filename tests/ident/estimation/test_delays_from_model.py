@@ -144,6 +144,7 @@ def test_late_joint_torques_are_found_and_the_motor_torques_against_the_motion(
     assert errors[0] < 0.9 * errors[1]
 
 
+@pytest.mark.slow
 def test_punctual_joint_torques_are_not_late_and_cost_no_certainty() -> None:
     days = [sensed(0.0, 1), sensed(0.0, 2, 6, loaded=True)]
     found = identify(days, chain(), SETTINGS)
@@ -157,6 +158,7 @@ def test_punctual_joint_torques_are_not_late_and_cost_no_certainty() -> None:
     assert np.median(found.estimate.std / known.estimate.std) < 1.1
 
 
+@pytest.mark.slow
 def test_delays_of_many_long_sessions_come_from_a_few_and_their_first_rows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

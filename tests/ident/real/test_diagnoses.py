@@ -80,6 +80,7 @@ def test_cable_of_the_wrist_and_lean_of_the_base_are_named(train, test, bound):
     assert np.all(np.abs(tilt - alone.tilt_rad) < 4.0 * np.hypot(std, alone.std))
 
 
+@pytest.mark.slow
 @needs_recordings
 @pytest.mark.parametrize(("train", "test", "bound"), SPLITS)
 def test_joint_torque_alone_makes_no_sure_claim_about_a_sensor(train, test, bound):

@@ -99,6 +99,7 @@ def test_a_position_in_another_unit_says_nothing_of_the_time(pair: list[Session]
 M, L = ("motor", "effort"), ("joint", "effort")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "side", "joints", "words", "certain", "where"),
     [
@@ -124,6 +125,7 @@ def test_a_torque_wrong_in_a_part_of_the_data_is_named_with_it(  # type: ignore[
         assert found.session.startswith(pair[where].path.name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("label", "mass", "wrong"),
     [("none", None, ("loaded",)), ("box", 3.2, ("unloaded",)), ("box", None, ("loaded", "unloaded"))],
@@ -151,6 +153,7 @@ def test_a_torque_that_drifts_in_each_session_is_named_in_all_of_them(pair: list
     assert "rises by" in found.seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "degrees", "joint"), [(0, 12.0, "A2"), (1, 8.0, "E1"), (1, -15.0, "A3")])
 def test_another_zero_of_a_position_is_named_in_its_session(
     pair: list[Session], number: int, degrees: float, joint: str
@@ -200,6 +203,7 @@ def test_both_sides_reversed_make_a_negative_inertia(pair: list[Session]) -> Non
     assert any(doubt.certain and "negative" in doubt.seen for doubt in doubts(both))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("up", [(1, 0, 0), (0, -1, 0), (0, 0, -1)])
 def test_an_arm_on_a_wall_or_a_ceiling_is_told_by_its_gravity(
     pair: list[Session], up: tuple[int, int, int]

@@ -52,6 +52,7 @@ def screened(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt", [False, True])
 def test_a_chosen_estimator_screens_once_and_gives_no_advice_on_chosen_cut_offs(
     trio: list[Session], screened: list[int], tilt: bool

@@ -120,6 +120,7 @@ def test_one_motion_serves_several_questions(experiment: Experiment, arm: Arm) -
     }
 
 
+@pytest.mark.slow
 def test_where_nothing_passes_nothing_is_offered(experiment: Experiment, arm: Arm) -> None:
     weak = replace(arm, tau_max=np.full(7, 1.0))
     cell = Cell.load(experiment.cell)

@@ -178,6 +178,7 @@ def test_published_motor_positions_are_led_to_the_same_torques(
     assert of(extended, "joint")[3] < 0.3 * of(base, "joint")[3]
 
 
+@pytest.mark.slow
 @needs_recordings
 def test_a_real_arm_is_replayed_to_the_error_of_its_model() -> None:
     found, run = identified((1, 2), "physical"), session(3)

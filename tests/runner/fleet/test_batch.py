@@ -26,6 +26,8 @@ from tests.fleet import Event, Fleet
 from tests.ident.known_arm import truth_model  # noqa: F401  fixture
 from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, flaws, opened
 
+pytestmark = pytest.mark.slow
+
 ARMS, DAYS = 5, 9
 EVENTS = (
     Event(1, "wear", 4, joint=2, size=0.12),
@@ -59,7 +61,6 @@ def batch(fleet: Fleet, *options: str):  # type: ignore[no-untyped-def]
     )
 
 
-@pytest.mark.slow
 def test_changes_are_found_on_their_day_and_nobody_else_is_accused(store: FleetStore) -> None:
     arms = {arm.arm: arm for arm in fleet_trend(store).arms}
     assert {name for name, arm in arms.items() if arm.changes} == {"LWR4+_arm_01", "LWR4+_arm_02"}
@@ -151,7 +152,6 @@ def test_trend_prints_and_writes_a_page(store: FleetStore, tmp_path: Path) -> No
     assert "LWR4+_arm_02" in unknown.output
 
 
-@pytest.mark.slow
 def test_the_pages_of_a_trend_are_accessible_and_fit(
     store: FleetStore, tmp_path: Path, chrome: Browser
 ) -> None:
@@ -165,7 +165,6 @@ def test_the_pages_of_a_trend_are_accessible_and_fit(
                 assert flaws(seen) == []
 
 
-@pytest.mark.slow
 def test_days_are_diagnosed_against_the_healthy_days_before(
     truth_model: DynamicModel,  # noqa: F811
     tmp_path: Path,
