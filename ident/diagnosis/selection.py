@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,7 +23,7 @@ from ident.diagnosis.products import Floats, Key, Rows, width_of
 from ident.diagnosis.rivals import confidence, exceeds, look_alikes
 from ident.diagnosis.score import Score
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.diagnosis.tolerances import HABIT, LENGTH, SIZE, Tolerance, tolerances
+from ident.diagnosis.tolerances import COMPLIANCE, HABIT, LENGTH, SIZE, Tolerance, tolerances
 from ident.diagnosis.usual_sizes import Healthy
 from ident.effects import EFFECTS
 
@@ -187,11 +187,6 @@ def _follows(trial: Trial, other: Trial) -> bool:
     )
 
 
-def _power(torque: Mapping[Key, Floats]) -> float:
-    """Sum of squares of a torque."""
-    return sum(float(np.sum(np.square(part))) for part in torque.values())
-
-
 def _gain(trial: Trial) -> float:
     """Gain for the order of candidates, with a penalty for freedom."""
     return trial.score.gain - 2.0 * trial.shape.freedom
@@ -320,14 +315,14 @@ class State:
                 return True
         return False
 
-    def _tolerable(self, trial: Trial) -> bool:
-        """Whether a trial is no larger than its own tolerated deviation may be: beside the others it was beyond."""
-        for one in self.tolerated():
-            if one.of == trial.candidate.key and one.rows.keys() == trial.rows.keys():
-                largest = _power({key: columns * (one.size / one.unit) for key, columns in one.rows.items()})
-                torque = {key: columns @ trial.score.coefficients for key, columns in trial.rows.items()}
-                return 0.0 < _power(torque) <= largest < np.inf
-        return False
+    def _of_unknown_stiffness(self, trial: Trial) -> bool:
+        """Whether a trial is a change of a compliance by no more than commissioning leaves unknown."""
+        known = [
+            one.size
+            for one in self.tolerated()
+            if one.of == trial.candidate.key and one.name.startswith(COMPLIANCE)
+        ]
+        return bool(known) and float(np.abs(trial.score.coefficients[0])) <= known[0]
 
     def _by_habits(self, trial: Trial) -> bool:
         """Whether a trial is more than on a healthy arm only beside habits in its rows: the healthy sets were without
@@ -406,7 +401,7 @@ class State:
             return False
         if healthy and (
             not self.null.exceeded(trial)
-            or self._tolerable(trial)
+            or self._of_unknown_stiffness(trial)
             or self._by_habits(trial)
             or self._of_own_law(trial)
         ):
