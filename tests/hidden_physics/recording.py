@@ -208,7 +208,7 @@ class _Bench:
         except BaseException as error:
             self.recording.close("fail", str(error))
             raise
-        self.recording.close("success", "")
+        self.recording.close("success", "", restarts=self.loop.remote.restarts)
 
 
 def record(order: Order, arm: Arm | None = None) -> Path:
