@@ -30,8 +30,7 @@ from scipy.optimize import minimize
 
 import ident.diagnosis.confidence as stored
 from benchmarks.discovery.tally import read_results
-from benchmarks.mujoco_arms.campaign import diagnosis_of, verdict_of
-from benchmarks.mujoco_arms.judging import habitual, names
+from benchmarks.mujoco_arms.judging import diagnosis_of, habitual, names, verdict_of
 
 Floats = NDArray[np.float64]
 

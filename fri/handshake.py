@@ -208,7 +208,7 @@ class IdentificationHandshake(_StatusHandshake):
         """
         wanted = np.asarray(load, dtype=np.float32)
         # The same load data again are no news to the program, though others were entered at the pendant since.
-        replaced = self.load_taken(cmd, msr) and not _same_load(self.load(msr), wanted)
+        replaced = self.load_taken(cmd, msr) and not same_load(self.load(msr), wanted)
         if int(cmd["krl_int"][13]) == 0 or replaced or not np.array_equal(cmd["krl_real"][:7], wanted):
             number = max(int(cmd["krl_int"][13]), int(msr["krl_int"][13])) + 1
             cmd["krl_real"][:7], cmd["krl_real"][7] = wanted, wanted.sum()
@@ -223,8 +223,9 @@ class IdentificationHandshake(_StatusHandshake):
         return np.array(msr["krl_real"][7:11], dtype=np.float64)
 
 
-def _same_load(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether mass [kg] and centre of mass [mm] agree within 1 g and 0.1 mm; without a mass there is no centre."""
+def same_load(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether mass [kg] and centre of mass [mm] of load data (4,) agree within 1 g and 0.1 mm, as they travel in
+    float32; false for NaN. Without a mass there is no centre."""
     mass, centre = abs(float(one[0] - other[0])), float(np.abs(one[1:4] - other[1:4]).max())
     return mass <= 1e-3 and (centre <= 0.1 or not (one[0] or other[0]))
 

@@ -15,13 +15,11 @@ from typing import Any
 from joblib import Parallel, delayed
 
 from benchmarks.mujoco_arms.cases import ALL, draw, kind_of, make
-from benchmarks.mujoco_arms.judging import judge
+from benchmarks.mujoco_arms.judging import diagnosis_of, judge, verdict_of
 from benchmarks.mujoco_arms.tally import rho_of
 from runner.file_names import DIAGNOSIS
 
 _LONGEST_S = 3600.0
-# Behind the names of what is written of a diagnosis without healthy days.
-_ALONE = "_without_reference"
 
 
 @dataclass(frozen=True)
@@ -56,16 +54,6 @@ def run(plan: Plan, jobs: int, say: Callable[[str], Any]) -> None:
     work = Parallel(n_jobs=jobs, return_as="generator_unordered")
     for line in work(delayed(_one)(plan, seed, kind) for seed, kind in plan.wanted()):
         say(line)
-
-
-def verdict_of(folder: Path, reference: bool = True) -> Path:
-    """Where the verdict on a case is stored."""
-    return folder / f"verdict{'' if reference else _ALONE}.json"
-
-
-def diagnosis_of(folder: Path, reference: bool = True) -> Path:
-    """Folder of the diagnosis of a case, or of its twin in `twin`."""
-    return folder / f"diagnosis{'' if reference else _ALONE}"
 
 
 def read_results(out: Path, reference: bool = True) -> list[dict[str, Any]]:

@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 SURE = 0.8
 """Confidence from which a finding claims its cause; below it says what it may be."""
 
 
+# Behind the names of what is written of a diagnosis without healthy days.
+_ALONE = "_without_reference"
 _SIGMAS = 3.0
 _AFFECTED = 1.03
 
 Finding = Mapping[str, Any]
+
+
+def verdict_of(folder: Path, reference: bool = True) -> Path:
+    """Where the verdict on a case is stored."""
+    return folder / f"verdict{'' if reference else _ALONE}.json"
+
+
+def diagnosis_of(folder: Path, reference: bool = True) -> Path:
+    """Folder of the diagnosis of a case, or of its twin in `twin`."""
+    return folder / f"diagnosis{'' if reference else _ALONE}"
 
 
 def confidence(finding: Finding) -> float:

@@ -318,8 +318,8 @@ def _beyond_healthy(
 def _channel_notes(nominal: Nominal, remainders: Sequence[Remainder]) -> list[str]:
     names = nominal.arm.chain.joint_names
     lines = [
-        f"the {r.side} torque of {names[r.joint - 1]} swings at {r.line_hz:.3g} Hz independently of the motion; look "
-        "for a vibration of the arm or hum in the channel at this frequency"
+        f"the {r.side} torque of {names[r.joint - 1]} swings at {_frequency(nominal, r.line_hz)} independently of the "
+        "motion; look for a vibration of the arm or hum in the channel at this frequency"
         for r in remainders
         if r.line_hz > 0.0
     ]
@@ -330,6 +330,14 @@ def _channel_notes(nominal: Nominal, remainders: Sequence[Remainder]) -> list[st
         for one in r.stuck
     ]
     return lines + stuck
+
+
+def _frequency(nominal: Nominal, line_hz: float) -> str:
+    """A frequency in rows; in those of longer means than usual one beyond their band looks like it."""
+    mean_s = nominal.bin_s
+    if mean_s <= nominal.settings.bin_s:
+        return f"{line_hz:.3g} Hz"
+    return f"{line_hz:.3g} or {1.0 / mean_s - line_hz:.3g} Hz, not told apart in means over {1e3 * mean_s:.0f} ms,"
 
 
 def _notes(task: Task, bench: DiagnosisBench, measured: Mapping[str, Floats]) -> list[str]:

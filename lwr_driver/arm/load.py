@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fri.errors import ConfigurationError
+from fri.handshake import same_load
 
 HEAVIEST_KG = 14.0
 FARTHEST_M = 0.5
 _TOLERANCE = 1e-6
-# Load data travel as float32, in kg and mm.
-_SAME_KG, _SAME_M = 1e-3, 1e-4
 
 
 @dataclass(frozen=True)
@@ -26,10 +25,8 @@ class LoadInForce:
 
     def agrees(self, other: LoadInForce) -> bool:
         """Whether these are the same load data but for rounding; false for NaN. Nothing has no centre of mass."""
-        if self.mass == other.mass == 0.0:
-            return True
-        away = max(abs(a - b) for a, b in zip(self.com, other.com, strict=True))
-        return abs(self.mass - other.mass) <= _SAME_KG and away <= _SAME_M
+        one, two = (np.array([load.mass, *(1e3 * value for value in load.com)]) for load in (self, other))
+        return same_load(one, two)
 
     def __str__(self) -> str:
         if self.mass == 0.0:
