@@ -176,7 +176,7 @@ def test_the_emulator_tells_its_ports_as_json() -> None:
 def test_the_help_of_every_command_has_an_example_that_it_understands(name: str) -> None:
     command = verb(name)
     result = CliRunner().invoke(main, [name, "-h"])
-    assert result.exit_code == 0
+    assert result.exit_code == 0, (result.output, result.exception)
     examples = [
         line.strip() for line in str(command.help).splitlines() if line.strip().startswith("lwr-run ")
     ]

@@ -229,12 +229,16 @@ def test_a_jog_names_its_joint() -> None:
     ],
 )
 def test_negative_degrees_are_no_option(line: str) -> None:
-    context = jog_command.make_context("jog", line.split())
+    context = jog_command.make_context(
+        "jog", line.split(), parent=click.Context(main, **main.context_settings)
+    )
     assert (context.params["joint"], context.params["degrees"]) == ("A6", -5.0)
     assert context.params["file"] == ("lab.yaml" if "lab" in line else str(DEFAULT))
     assert context.params["speed"] == (0.05 if "speed" in line else 0.1)
     with pytest.raises(click.UsageError):
-        jog_command.make_context("jog", ["A6", "-5", "--unknown"])
+        jog_command.make_context(
+            "jog", ["A6", "-5", "--unknown"], parent=click.Context(main, **main.context_settings)
+        )
 
 
 @pytest.mark.parametrize(
