@@ -324,17 +324,21 @@ class _Bench:
         count = worst.samples + worst.lost
         if worst.share < _MANY:
             return f"{said}: they are too short; record longer ones"
-        kinds = {"repeat the one before": worst.repeated, "are lost by the counter": worst.lost}
-        kind = max(
-            kinds | {"are older than their stamps": worst.stale},
-            key=lambda name: kinds.get(name, worst.stale),
+        amount, kind, advice = max(
+            (
+                worst.repeated,
+                "repeat the one before",
+                "the recorder polls faster than the arm measures. Record at the arm's rate, or remove the rows that "
+                "repeat others and import again",
+            ),
+            (
+                worst.lost,
+                "are lost by the counter",
+                "record without losses, or import without the counter if it counts otherwise",
+            ),
+            (worst.stale, "are older than their stamps", "record with the stamps of the arm's own clock"),
+            key=lambda one: one[0],
         )
-        amount = kinds.get(kind, worst.stale)
-        advice = {
-            "repeat the one before": "the recorder polls faster than the arm measures. Record at the arm's rate, or "
-            "remove the rows that repeat others and import again",
-            "are lost by the counter": "record without losses, or import without the counter if it counts otherwise",
-        }.get(kind, "record with the stamps of the arm's own clock")
         return f"{said}: {100.0 * amount / count:.0f} % of the {count} samples of {worst.session} {kind}; {advice}"
 
     def _shared(self, speed: Floats, joint: int, settings: SignalSettings) -> Floats:
