@@ -73,9 +73,8 @@ def diagnose(
         raise DataError("no session given; name at least one session file")
     couplings = () if arm is None else arm.couplings
     ready = preparation(sessions, test, chain, settings, couplings, reference)
-    settings, broken = ready.settings, ready.broken
+    settings, recordings, broken = ready.settings, ready.recordings, ready.broken
     with blamed(broken, chain.joint_names):
-        recordings = without_broken(ready.recordings, broken)
         nominal = nominal_arm(chain, arm, reference)
         task = Task(
             sessions, test, nominal, recordings, settings, reference, causes, model, simulate, not broken

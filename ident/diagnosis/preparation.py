@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from ident.diagnosis.broken_data import BrokenChannel, blamed, broken_channels
+from ident.diagnosis.broken_data import BrokenChannel, blamed, broken_channels, without_broken
 from ident.diagnosis.recording import SessionRecord, record, settled, some_joint_moves
 from ident.diagnosis.reference import Reference
 from ident.diagnosis.settings import DiagnosisSettings
@@ -18,8 +18,8 @@ from lwr_driver.session import Session
 
 @dataclass(frozen=True, eq=False)
 class Preparation:
-    """Records of all sessions in the order of their beginnings, with the channels in them that are broken, and the
-    settings with the signals that they were filtered with."""
+    """Records of all sessions in the order of their beginnings, without the channels that are broken, and the settings
+    with the signals that they were filtered with."""
 
     settings: DiagnosisSettings
     recordings: tuple[SessionRecord, ...]
@@ -56,4 +56,4 @@ def preparation(
             record(s, k, chain, settings, test=id(s) in held, recall=recall) for k, s in enumerate(everything)
         )
         some_joint_moves(recordings)
-    return Preparation(settings, recordings, tuple(broken))
+        return Preparation(settings, without_broken(recordings, broken), tuple(broken))

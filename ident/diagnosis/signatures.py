@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.diagnosis.bench import ArmData, DiagnosisBench, nominal_arm, prepare_bench
-from ident.diagnosis.broken_data import BrokenChannel, without_broken
+from ident.diagnosis.broken_data import BrokenChannel
 from ident.diagnosis.candidates import Candidate, Trial
 from ident.diagnosis.preparation import preparation
 from ident.diagnosis.products import Floats, Key, Rows
@@ -77,9 +77,10 @@ def signature_bench(
         raise DataError("no session given; name at least one session file")
     couplings = () if arm is None else arm.couplings
     ready = preparation(sessions, (), chain, settings, couplings, reference, broken)
-    recordings = without_broken(ready.recordings, broken)
     known = nominal_arm(chain, arm, reference)
-    bench = prepare_bench(known, recordings, ready.settings, reference, (), fit_compliance=reference is None)
+    bench = prepare_bench(
+        known, ready.recordings, ready.settings, reference, (), fit_compliance=reference is None
+    )
     select(bench.dictionary, bench.evidence, ready.settings)
     return bench
 

@@ -46,8 +46,8 @@ class Residuals:
     named: bool
 
     @classmethod
-    def of(cls, diagnosis: Diagnosis, sessions: Sequence[str], gear_ratio: Floats | None) -> Residuals:
-        """From a diagnosis. sessions : names in the order of their beginnings."""
+    def of(cls, diagnosis: Diagnosis, gear_ratio: Floats | None) -> Residuals:
+        """From a diagnosis."""
         names = diagnosis.base_model.structure.chain.joint_names
         sides = {}
         for side, base in diagnosis.residuals.get("base", {}).items():
@@ -56,7 +56,7 @@ class Residuals:
                 **vars(state), base=base, extended=extended if extended.shape == base.shape else base
             )
         ratio = np.ones(len(names)) if gear_ratio is None else np.asarray(gear_ratio, dtype=float)
-        return cls(names, tuple(sessions), ratio, sides, bool(diagnosis.extension))
+        return cls(names, diagnosis.numbered, ratio, sides, bool(diagnosis.extension))
 
     def save(self, path: Path) -> None:
         """Write the file, in single precision."""

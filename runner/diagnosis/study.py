@@ -55,15 +55,14 @@ class Material:
 class Study:
     """A diagnosis with its limits, look-alikes and discriminating experiments.
 
-    notes : limits of the data and of the replay. sessions : names in their order. pairs : look-alikes, side by side.
-    replayed : errors of the simulation over time. offers : discriminating experiments. material : the inputs.
-    sure : confidence below which a finding with alternatives is open.
+    notes : limits of the data and of the replay. pairs : look-alikes, side by side. replayed : errors of the simulation
+    over time. offers : discriminating experiments. material : the inputs. sure : confidence below which a finding with
+    alternatives is open.
     """
 
     diagnosis: Diagnosis
     notes: tuple[str, ...]
     residuals: Residuals
-    sessions: tuple[str, ...]
     pairs: tuple[LookAlikes, ...] = ()
     replayed: ReplayErrors | None = None
     offers: tuple[Discriminating, ...] = field(default=())
@@ -170,12 +169,10 @@ def study(
     if replay is not None:
         notes += replay.notes
     notes += unshown
-    names = tuple(session.path.name for session in everything)
     return Study(
         found,
         tuple(notes),
-        Residuals.of(found, names, data.gear_ratio),
-        names,
+        Residuals.of(found, data.gear_ratio),
         pairs,
         _first_replay(replay),
         material=Material(tuple(sessions), chain, data, healthy),
