@@ -5,10 +5,10 @@
     python -m benchmarks.confidence --alone campaign/results_without_reference.jsonl mujoco_cases --write
     python -m benchmarks.confidence --check other/results.jsonl --check other_cases --diagram confidence.svg
 
-Reads the findings of campaigns of `benchmarks.discovery` (their `results.jsonl`) and of `benchmarks.mujoco_arms`
-(their folder), for the fit with the names that were doubted. The weights of `ident/diagnosis/confidence.yaml`, or with
+Reads the findings of campaigns of `benchmarks.discovery` (their `results.jsonl`) and of `benchmarks.mujoco_arms` (their
+folder), for the fit with the names that were doubted. The weights of `ident/diagnosis/verdict/confidence.yaml`, or with
 `--alone` of `confidence_alone.yaml`, are those of a logistic regression with the signs of
-`ident.diagnosis.confidence.SIGNS`, each generator with the same weight, and a pull to `START` chosen by
+`ident.diagnosis.verdict.confidence.SIGNS`, each generator with the same weight, and a pull to `START` chosen by
 cross-validation over whole cases. The reliability printed for the fit is that of cross-validation too. `--check` judges
 the confidence as the diagnoses stated it.
 """
@@ -28,7 +28,7 @@ import yaml
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-import ident.diagnosis.confidence as stored
+import ident.diagnosis.verdict.confidence as stored
 from benchmarks.discovery.tally import read_results
 from benchmarks.mujoco_arms.judging import diagnosis_of, habitual, names, verdict_of
 

@@ -26,6 +26,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import click
@@ -75,14 +76,19 @@ def numbers() -> Iterator[Number]:
         value = field.default
         if isinstance(value, (int, float)) and not isinstance(value, bool) and field.name not in _LEFT_OUT:
             yield Number(_SETTINGS, field.name, value)
-    for module in pkgutil.iter_modules(ident.diagnosis.__path__):
-        if module.name in _IN_WORDS:
+    for module, loaded in _modules():
+        if module in _IN_WORDS:
             continue
-        loaded = importlib.import_module(f"ident.diagnosis.{module.name}")
         for name, value in vars(loaded).items():
             own = name.isupper() and name not in _LEFT_OUT and _is_own(loaded, name)
             if own and isinstance(value, (int, float)) and not isinstance(value, bool) and value:
-                yield Number(module.name, name, value)
+                yield Number(module, name, value)
+
+
+def _modules() -> Iterator[tuple[str, ModuleType]]:
+    """All modules of the diagnosis by name, in every room."""
+    for module in pkgutil.walk_packages(ident.diagnosis.__path__, "ident.diagnosis."):
+        yield module.name.rpartition(".")[2], importlib.import_module(module.name)
 
 
 def _is_own(module: Any, name: str) -> bool:
@@ -155,9 +161,8 @@ class _changed:
     def _set(self, value: float) -> None:
         name = self.number.name
         if self.number.module != _SETTINGS:
-            for module in pkgutil.iter_modules(ident.diagnosis.__path__):
-                loaded = importlib.import_module(f"ident.diagnosis.{module.name}")
-                if module.name == self.number.module or (not name.startswith("_") and hasattr(loaded, name)):
+            for module, loaded in _modules():
+                if module == self.number.module or (not name.startswith("_") and hasattr(loaded, name)):
                     setattr(loaded, name, value)
             return
         names = [field.name for field in dataclasses.fields(DiagnosisSettings)]

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from fri.errors import LwrError
-from ident.diagnosis.reference import Reference
+from ident.diagnosis.healthy.reference import Reference
 from ident.model import DynamicModel
 from ident.model.model_file import read_model
 from lwr_driver.configuration import find

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ident.diagnosis.statements import Statements
+from ident.diagnosis.outcome.statements import Statements
 from ident.estimation.scores import by_side
 from lwr_driver.listing import Piece
 from runner import status
@@ -21,7 +21,7 @@ from runner.report.verdicts import Level, Verdict, estimate_lines, headline, ver
 from runner.terminal import verbosity
 
 if TYPE_CHECKING:  # a command imports its own alone
-    from ident.diagnosis.look_alikes import LookAlikes
+    from ident.diagnosis.outcome.look_alikes import LookAlikes
     from ident.estimation.compare import Comparison
     from ident.estimation.payload import PayloadEstimate
     from ident.estimation.validate import Validation

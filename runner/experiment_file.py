@@ -186,7 +186,7 @@ class DiagnosisPlan:
 
     run: bool = True
     reference: FileName | None = None
-    # ident.diagnosis.claims_in_words.SURE, not imported here: commands would start slower
+    # ident.diagnosis.outcome.claims_in_words.SURE, not imported here: commands would start slower
     sure: Annotated[float, within(0.5, 1.0, "share", below=True, note="0.8 is usual")] = 0.8
 
     def __post_init__(self) -> None:

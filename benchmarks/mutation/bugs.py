@@ -294,7 +294,7 @@ BUGS: tuple[Bug, ...] = (
     ),
     Bug(
         "a late channel is dropped for slow rows with the reversals in them",
-        "ident/diagnosis/late_channels.py",
+        "ident/diagnosis/verdict/late_channels.py",
         "    if told is not None:\n        return told\n    bench.evidence.replace([])\n",
         "    bench.evidence.replace([])\n",
         (

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 from fri.on_first_use import on_first_use
 
 if TYPE_CHECKING:
-    from ident.diagnosis.bench import ArmData
-    from ident.diagnosis.commission import commission
     from ident.diagnosis.diagnose import diagnose
-    from ident.diagnosis.reference import Reference
-    from ident.diagnosis.result import Diagnosis, Finding, SimulationError
+    from ident.diagnosis.healthy.bench import ArmData
+    from ident.diagnosis.healthy.commission import commission
+    from ident.diagnosis.healthy.reference import Reference
+    from ident.diagnosis.outcome.result import Diagnosis, Finding, SimulationError
     from ident.diagnosis.settings import DiagnosisSettings
 
 __all__ = [
@@ -26,11 +26,11 @@ __all__ = [
 ]
 
 _HOMES = {
-    ".bench": ("ArmData",),
-    ".commission": ("commission",),
+    ".healthy.bench": ("ArmData",),
+    ".healthy.commission": ("commission",),
     ".diagnose": ("diagnose",),
-    ".reference": ("Reference",),
-    ".result": (
+    ".healthy.reference": ("Reference",),
+    ".outcome.result": (
         "Diagnosis",
         "Finding",
         "SimulationError",

@@ -8,30 +8,30 @@ from dataclasses import replace
 import numpy as np
 
 from fri.errors import DataError
-from ident.diagnosis.against_healthy import against_healthy
-from ident.diagnosis.bench import (
+from ident.diagnosis.causes.selection import Selection, best_candidate, longer_turns
+from ident.diagnosis.healthy.against_healthy import against_healthy
+from ident.diagnosis.healthy.bench import (
     ArmData,
     DiagnosisBench,
     again_with,
     nominal_arm,
 )
-from ident.diagnosis.broken_data import (
+from ident.diagnosis.healthy.channel_delays import sides_apart
+from ident.diagnosis.healthy.preparation import preparation
+from ident.diagnosis.healthy.reference import Reference
+from ident.diagnosis.outcome.result import Diagnosis
+from ident.diagnosis.rows.broken_data import (
     BrokenChannel,
     blamed,
     is_broken,
     without_broken,
     worthless,
 )
-from ident.diagnosis.channel_delays import sides_apart
-from ident.diagnosis.conclusion import conclude
-from ident.diagnosis.late_channels import in_time, late_by_themselves, without_late
-from ident.diagnosis.payloads import other_masses, payload_finding, unstated_body, with_masses
-from ident.diagnosis.preparation import preparation
-from ident.diagnosis.reference import Reference
-from ident.diagnosis.result import Diagnosis
-from ident.diagnosis.selection import Selection, best_candidate, longer_turns
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.diagnosis.task import Simulate, State, Task
+from ident.diagnosis.verdict.conclusion import conclude
+from ident.diagnosis.verdict.late_channels import in_time, late_by_themselves, without_late
+from ident.diagnosis.verdict.payloads import other_masses, payload_finding, unstated_body, with_masses
+from ident.diagnosis.verdict.task import Simulate, State, Task
 from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, PRESLIDING
 from ident.model import Model, as_model

@@ -83,7 +83,7 @@ def command(
     lwr-run diagnose a.mcap --no-simulation --json --out diagnosis    quicker, and for a program
     """
     from fri.errors import ConfigurationError
-    from ident.diagnosis.claims_in_words import SURE
+    from ident.diagnosis.outcome.claims_in_words import SURE
     from ident.import_log import read_recording
     from ident.model.model_file import read_model
     from runner.diagnosis import arm_data, asked, chain_of, study

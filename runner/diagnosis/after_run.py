@@ -16,9 +16,9 @@ from typing import Any, Literal
 
 from fri.errors import LwrError
 from ident.diagnosis import Diagnosis, Finding
-from ident.diagnosis.claims_in_words import SURE, answer_statement
-from ident.diagnosis.look_alikes import Place
-from ident.diagnosis.statements import run_advice
+from ident.diagnosis.outcome.claims_in_words import SURE, answer_statement
+from ident.diagnosis.outcome.look_alikes import Place
+from ident.diagnosis.outcome.statements import run_advice
 from ident.dynamics.kinematics import Chain
 from ident.model.model_file import read_model
 from lwr_driver.arm import Arm

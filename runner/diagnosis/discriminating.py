@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError, LwrError, RefusedError
 from ident.diagnosis import ArmData, Diagnosis, Finding, Reference
-from ident.diagnosis.claims_in_words import SURE, is_open
-from ident.diagnosis.look_alikes import Foreseen, LookAlikes, Place
-from ident.diagnosis.signatures import overlap, signature_bench, signatures
+from ident.diagnosis.outcome.claims_in_words import SURE, is_open
+from ident.diagnosis.outcome.look_alikes import Foreseen, LookAlikes, Place
+from ident.diagnosis.outcome.signatures import overlap, signature_bench, signatures
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, WEAR
 from ident.effects import Discriminator as Kind

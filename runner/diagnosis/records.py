@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.diagnosis import Diagnosis
-from ident.diagnosis.look_alikes import LookAlikes, Trace
-from ident.diagnosis.result import RowStates
+from ident.diagnosis.outcome.look_alikes import LookAlikes, Trace
+from ident.diagnosis.outcome.result import RowStates
 from runner.replay import Replayed
 
 Floats = NDArray[np.float64]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.diagnosis import ArmData, Diagnosis, DiagnosisSettings, Reference, diagnose
-from ident.diagnosis.claims_in_words import SURE
-from ident.diagnosis.look_alikes import LookAlikes, Place, look_alikes
-from ident.diagnosis.statements import Statements, statements
+from ident.diagnosis.outcome.claims_in_words import SURE
+from ident.diagnosis.outcome.look_alikes import LookAlikes, Place, look_alikes
+from ident.diagnosis.outcome.statements import Statements, statements
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.session_chain import session_chain
 from ident.effects import find_effect

@@ -6,7 +6,7 @@ from html import escape
 
 import numpy as np
 
-from ident.diagnosis.statements import Number
+from ident.diagnosis.outcome.statements import Number
 from ident.monitoring import Series
 from runner.computer import versions
 from runner.fleet.trend import ArmTrend, FleetTrend, Named, as_day

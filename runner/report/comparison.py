@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ident.diagnosis.statements import Number
+from ident.diagnosis.outcome.statements import Number
 from ident.estimation.compare import Comparison, Difference
 from ident.model import DynamicModel
 from runner.computer import versions

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from fri.errors import ConfigurationError, DataError
-from ident.diagnosis.claims_in_words import Comparison, FindingStatement, capital
-from ident.diagnosis.look_alikes import LookAlikes
-from ident.diagnosis.statements import Part, Statements, run_advice, statements
+from ident.diagnosis.outcome.claims_in_words import Comparison, FindingStatement, capital
+from ident.diagnosis.outcome.look_alikes import LookAlikes
+from ident.diagnosis.outcome.statements import Part, Statements, run_advice, statements
 from runner.diagnosis.records import (
     LOOK_ALIKES,
     REPLAY,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from ident.diagnosis.look_alikes import LookAlikes, Trace
-from ident.diagnosis.statements import REPLAYED
+from ident.diagnosis.outcome.look_alikes import LookAlikes, Trace
+from ident.diagnosis.outcome.statements import REPLAYED
 from ident.effects import WEAR, Parameters, find_effect
 from ident.effects.words import joints_text, spoken
 from runner.diagnosis.records import ReplayErrors, Residuals, SideResiduals

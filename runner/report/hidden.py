@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-from ident.diagnosis.claims_in_words import capital
+from ident.diagnosis.outcome.claims_in_words import capital
 from runner.hiding.reveal import revealed
 from runner.report.folder import ResultFolder
 from runner.report.markup import Cell, paragraph, section, table

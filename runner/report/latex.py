@@ -15,7 +15,7 @@ import re
 from pathlib import Path
 
 from fri.errors import ConfigurationError
-from ident.diagnosis.statements import Number
+from ident.diagnosis.outcome.statements import Number
 from runner.report import tables
 from runner.report.folder import ResultFolder
 from runner.report.markup import Cell

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from ident.diagnosis.statements import Number
+from ident.diagnosis.outcome.statements import Number
 from runner.report.figure import Figure
 from runner.report.interactive import chart_json, panel_chart
 from runner.report.plot import STYLES, Role

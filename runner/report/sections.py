@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-from ident.diagnosis.statements import Number
+from ident.diagnosis.outcome.statements import Number
 from runner.published import SOURCE, TABLE_2
 from runner.report import tables
 from runner.report.figures import (

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ident.diagnosis.statements import Number
+from ident.diagnosis.outcome.statements import Number
 from runner.published import REBUILT, TABLE_1, TABLE_2, PredictedMotion, planned, rebuilt
 from runner.report.figures import interval_95, pretty_unit
 from runner.report.folder import ResultFolder

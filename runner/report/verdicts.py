@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ident.diagnosis.claims_in_words import capital
-from ident.diagnosis.statements import in_short
+from ident.diagnosis.outcome.claims_in_words import capital
+from ident.diagnosis.outcome.statements import in_short
 from ident.model import DynamicModel
 from runner.report.folder import Curves, ResultFolder
 

@@ -90,9 +90,9 @@ def test_modules_and_their_names_in_docstrings_exist(folder: str) -> None:
 @pytest.mark.parametrize(
     ("name", "there"),
     [
-        ("ident.diagnosis.wear", True),
-        ("ident.diagnosis.wear.wear", True),
-        ("ident.diagnosis.wear.gone", False),
+        ("ident.diagnosis.verdict.wear", True),
+        ("ident.diagnosis.verdict.wear.wear", True),
+        ("ident.diagnosis.verdict.wear.gone", False),
         ("ident.diagnosis.gone.wear", False),
         ("sim_backend.plant.Effect", False),
         ("sim_backend.plant.PlantEffect", True),

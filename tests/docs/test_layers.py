@@ -58,9 +58,13 @@ def order(first: str) -> dict[str, int]:
     return {name: level for level, part in enumerate(line[0].split(" < ")) for name in part.split(", ")}
 
 
-@pytest.mark.parametrize(("first", "prefix"), [("fri", ""), ("dynamics", "ident.")])
+@pytest.mark.parametrize(
+    ("first", "prefix"), [("fri", ""), ("dynamics", "ident."), ("settings", "ident.diagnosis.")]
+)
 def test_imports_go_down_the_stated_order(first: str, prefix: str) -> None:
     levels = order(first)
+    members = {name.removeprefix(prefix).partition(".")[0] for name in FILES if name.startswith(prefix)}
+    assert {*levels} == members
     for module, found in graph().items():
         for other in found:
             mine, its = (name.removeprefix(prefix).partition(".")[0] for name in (module, other))

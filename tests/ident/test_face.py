@@ -28,7 +28,7 @@ from ident import (
     validate,
     write_model,
 )
-from ident.diagnosis.result import Diagnosis, Evident, Finding, Unexplained, Value
+from ident.diagnosis.outcome.result import Diagnosis, Evident, Finding, Unexplained, Value
 from ident.rows import SignalSettings
 
 matplotlib.use("Agg")

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from ident.diagnosis.look_alikes import LookAlikes
+from ident.diagnosis.outcome.look_alikes import LookAlikes
 from lwr_driver.session import describe
 from runner.commands.fleet import doubts
 from runner.ending import compared, numbers_of, of_session

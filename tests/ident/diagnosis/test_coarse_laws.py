@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import diagnose
-from ident.diagnosis.candidates import Candidate
-from ident.diagnosis.model_form import model_form_error
-from ident.diagnosis.products import Rows
-from ident.diagnosis.signatures import signature_bench
+from ident.diagnosis.causes.candidates import Candidate
+from ident.diagnosis.causes.model_form import model_form_error
+from ident.diagnosis.gain.products import Rows
+from ident.diagnosis.outcome.signatures import signature_bench
 from ident.dynamics.kinematics import Chain
 from ident.effects import find_effect
 from tests.ident.diagnosis.changes import Make, Signals, pair, stribeck

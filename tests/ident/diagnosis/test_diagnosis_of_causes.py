@@ -13,7 +13,7 @@ import pytest
 
 from fri.errors import DataError
 from ident.diagnosis import ArmData, Diagnosis, Reference, commission, diagnose
-from ident.diagnosis.recording import sensor_limits
+from ident.diagnosis.rows.recording import sensor_limits
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
 from ident.model.model_file import model_text, read_model
@@ -228,7 +228,7 @@ def test_a_delay_that_slow_rows_contradict_is_known_no_better_than_their_differe
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (plain,) = diagnosed(late_motor).claims
-    module = importlib.import_module("ident.diagnosis.late_channels")
+    module = importlib.import_module("ident.diagnosis.verdict.late_channels")
     monkeypatch.setattr(module, "slow_delay", lambda *_: (0.0075, 1e-4))
     (late,) = diagnose(pair(make, late_motor), chain).claims
     assert plain.parameters["delay"].std < 5e-4

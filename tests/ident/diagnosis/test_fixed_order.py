@@ -9,7 +9,7 @@ import sys
 _SCRIPT = """
 import numpy as np
 from types import SimpleNamespace
-from ident.diagnosis.evidence import Evidence
+from ident.diagnosis.gain.evidence import Evidence
 
 random = np.random.default_rng(1)
 keys = [(side, joint) for side in ("motor", "joint") for joint in range(7)]

@@ -11,7 +11,7 @@ import pytest
 
 from fri.errors import ConfigurationError
 from ident.diagnosis import Reference, commission, diagnose
-from ident.diagnosis.reference import shared
+from ident.diagnosis.healthy.reference import shared
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import LINK_FRICTION
@@ -116,7 +116,7 @@ def test_a_late_channel_is_held_against_rows_away_from_reversals_where_these_tel
     made = [make("a.mcap", 71, later), make("b.mcap", 72, later, 1)]
     bare = [replace(s, joint=replace(s.joint, effort=s.joint.effort[:, :0])) for s in made]
     # Slow rows have reversals in them, with friction of the day that turns in another way, and so has each joint.
-    module = importlib.import_module("ident.diagnosis.late_channels")
+    module = importlib.import_module("ident.diagnosis.verdict.late_channels")
     monkeypatch.setattr(module, "slow_delay", lambda *_: (0.014, 1e-4))
     monkeypatch.setattr(module, "_late_in_all_joints", lambda *_: False)
     (found,) = diagnose(bare, chain, reference=reference).findings

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import Diagnosis, diagnose
-from ident.diagnosis.evidence import Evidence
-from ident.diagnosis.torque_errors import TorqueErrors
+from ident.diagnosis.gain.evidence import Evidence
+from ident.diagnosis.outcome.torque_errors import TorqueErrors
 from ident.dynamics.kinematics import Chain
 from ident.estimation.validate import validate
 from ident.model import DynamicModel
@@ -141,7 +141,9 @@ def test_where_no_extension_predicts_better_nothing_says_that_there_is_one(
     # As with the drawing of an arm, so that `identify` makes the models.
     monkeypatch.setattr(Evidence, "drawn", property(lambda self: True))
     monkeypatch.setattr(TorqueErrors, "of", measured)
-    monkeypatch.setattr("ident.diagnosis.conclusion.believable", lambda grounds: not grounds.get("worse"))
+    monkeypatch.setattr(
+        "ident.diagnosis.verdict.conclusion.believable", lambda grounds: not grounds.get("worse")
+    )
     logs = [make(f"{k}.mcap", seed, three_errors, k) for k, seed in enumerate((1, 2, 5))]
     told = diagnose(logs[:2], chain, test=logs[2:], causes=["cable_spring", "friction_asymmetry"])
     fitted, left = ([(one.side, one.joint) for one in part] for part in (told.nameless, told.unexplained))

@@ -11,9 +11,9 @@ import pytest
 
 from fri.errors import DataError
 from ident.diagnosis import Diagnosis, DiagnosisSettings, diagnose
-from ident.diagnosis.candidates import Dictionary
-from ident.diagnosis.signatures import signature_bench
-from ident.diagnosis.tolerances import tolerances
+from ident.diagnosis.causes.candidates import Dictionary
+from ident.diagnosis.causes.tolerances import tolerances
+from ident.diagnosis.outcome.signatures import signature_bench
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
 from ident.rows.filters import SignalSettings, low_pass

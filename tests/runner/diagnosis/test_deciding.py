@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ident.diagnosis import Finding
-from ident.diagnosis.claims_in_words import answer_statement
+from ident.diagnosis.outcome.claims_in_words import answer_statement
 from ident.effects import EFFECTS
 from ident.effects.words import quantity_text
 from ident.excitation import ExcitationPlan

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from ident.diagnosis.claims_in_words import SURE, is_open
-from ident.diagnosis.statements import statements
+from ident.diagnosis.outcome.claims_in_words import SURE, is_open
+from ident.diagnosis.outcome.statements import statements
 from runner.experiment_file import DiagnosisPlan
 from runner.report.diagnosis import DiagnosisFolder
 from runner.report.page import diagnosis_html

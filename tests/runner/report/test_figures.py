@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from fri.errors import ConfigurationError
-from ident.diagnosis.statements import Number, Part
+from ident.diagnosis.outcome.statements import Number, Part
 from ident.estimators.estimate import percent
 from runner.report.diagnosis import _part
 from runner.report.figure import Figure, MatrixFigure, inline_svg

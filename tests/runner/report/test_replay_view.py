@@ -17,7 +17,7 @@ from PIL import Image
 from playwright.sync_api import Browser
 
 from fri.errors import ConfigurationError
-from ident.diagnosis.reference import Reference
+from ident.diagnosis.healthy.reference import Reference
 from ident.model.model_file import read_model, write_model
 from runner.cli import main
 from runner.encoder import encoder_of

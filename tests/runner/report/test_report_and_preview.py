@@ -21,7 +21,7 @@ from click.testing import CliRunner
 from PIL import Image
 from playwright.sync_api import Browser, Page
 
-from ident.diagnosis.statements import error_change
+from ident.diagnosis.outcome.statements import error_change
 from ident.excitation import ExcitationPlan, PlanProblem, assemble, table_row
 from lwr_driver.configuration import find
 from lwr_driver.session import Session

@@ -1,0 +1,1 @@
+"""The choice of causes: candidates, what a healthy arm shows of them, selection, parameters."""

@@ -1,0 +1,1 @@
+"""What columns add to the base model: products in blocks of rows, evidence, scores, held-out errors."""

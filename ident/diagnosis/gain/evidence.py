@@ -1,0 +1,489 @@
+"""Evidence for columns beyond the base: held-back gain and significance from Gram matrices of blocks.
+
+Rows of all joints and sides are cut into blocks of time; of each block only products of columns are kept. A fit
+without a part of the motion, its error on that part and the covariance from blocks are then linear algebra of small
+matrices: Schur complements on the base. The held-back parts are the same phases of every period, so a repeating
+motion never checks itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fri.errors import DataError
+from ident.diagnosis.gain.products import (
+    Fit,
+    Floats,
+    Key,
+    Products,
+    Rows,
+    Sums,
+    add_products,
+    block_sums,
+    inverse_of,
+    left_beside,
+    scale_of,
+    schur,
+    width_of,
+)
+from ident.diagnosis.gain.score import Score, widened
+from ident.diagnosis.rows.nominal import Nominal
+from ident.diagnosis.settings import DiagnosisSettings
+from ident.estimators.estimate import chi_square_tail
+from ident.estimators.physical import lacking_bodies
+from lwr_driver.session.spool import Arena
+
+# Least share of a column's power left by base parameters without the prior, where the prior is a drawing.
+_OWN_SHARE = 3e-3
+
+# A fall of the chi-square up to this is no evidence, whatever its value on the held-back parts.
+_NO_EVIDENCE = 12.0
+
+_Columns = Mapping[Key, Floats] | Callable[[], Mapping[Key, Floats]]
+
+
+class Evidence:
+    """Block products of the base and of accepted columns.
+
+    sigma : noise of a row [Nm] by side, (n,). variance_inflation : by side, (n,), of correlated noise.
+    prior : precision (p, p) and values (p,) of the base parameters, from a reference. Where they are `compared`,
+    causes otherwise absorbed by the base parameters show as well.
+    floor : repeatability of a row [Nm] by side, (n,); default sigma.
+    """
+
+    def __init__(
+        self,
+        nominal: Nominal,
+        settings: DiagnosisSettings,
+        sigma: Mapping[str, Floats],
+        variance_inflation: Mapping[str, Floats],
+        prior: tuple[Floats, Floats] | None = None,
+        *,
+        compared: bool = True,
+        floor: Mapping[str, Floats] | None = None,
+    ) -> None:
+        self.settings, self.prior, self.compared = settings, prior, compared
+        self._arena = Arena()
+        self.floor = dict(sigma if floor is None else floor)
+        self.nominal = nominal
+        self.sigma = {side: np.array(value) for side, value in sigma.items()}
+        self.variance_inflation = {side: np.array(value) for side, value in variance_inflation.items()}
+        self._layout(nominal)
+        self.mask: dict[Key, Floats] = {}
+        self._weights: dict[Key, float] = {}
+        self._independent: dict[Key, float] = {}
+        self._columns: dict[Key, Floats] = {}
+        self._acting: dict[Key, NDArray[np.int64]] = {}
+        self._targets: dict[Key, Floats] = {}
+        for side, rows in nominal.rows.items():
+            for j in range(nominal.arm.chain.n):
+                key, keep = (side, j), rows.valid[:, j] & ~rows.test
+                wide = np.where(keep[:, None], rows.matrix[j], 0.0)
+                self._weights[key] = 1.0 / (self.sigma[side][j] ** 2 * self.variance_inflation[side][j])
+                # Most base columns do not act on most joints.
+                self._acting[key] = np.flatnonzero(np.any(wide != 0.0, axis=0))
+                self._columns[key] = self._arena.keep(wide[self._order[side]][:, self._acting[key]])
+                self._targets[key] = np.where(keep, rows.target[:, j], 0.0)[self._order[side], None]
+                self.mask[key] = keep[self._order[side], None].astype(float)
+                self._independent[key] = float(keep.sum()) / float(self.variance_inflation[side][j])
+        self.base_count = len(nominal.base)
+        self.extra: list[Rows] = []
+        self._known: dict[int, tuple[Rows, dict[Key, Floats], Products]] = {}
+        self._joined: dict[tuple[int, ...], dict[Key, Floats]] = {}
+        self._base_products()
+        self._gram()
+
+    # ---- layout ----
+
+    def _layout(self, nominal: Nominal) -> None:
+        """Blocks of time, the same on all sides, and the part of the motion of each."""
+        settings = self.settings
+        numbers: dict[tuple[int, int], int] = {}
+        folds: list[int] = []
+        start = {r.number: r.start_s for r in nominal.recordings}
+        period = {r.number: r.period_s for r in nominal.recordings}
+        # A motion without repetition gives half as long a block, for enough of them.
+        parts = {r.number: (2.0 if r.repeats else 4.0) * settings.folds for r in nominal.recordings}
+        length = {r.number: min(settings.block_s, r.period_s / parts[r.number]) for r in nominal.recordings}
+        ids: dict[str, NDArray[np.int64]] = {}
+        for side, rows in nominal.rows.items():
+            found = np.full(len(rows.time), -1)
+            for session in np.unique(rows.session[~rows.test]).tolist():
+                mine = np.flatnonzero(~rows.test & (rows.session == session))
+                since = rows.time[mine] - start[session]
+                within = (since / length[session]).astype(np.int64)
+                blocks, first, place = np.unique(within, return_index=True, return_inverse=True)
+                known = np.empty(len(blocks), dtype=np.int64)
+                # In the order of time, as they are met.
+                for k in np.argsort(first, kind="stable"):
+                    block = (session, int(blocks[k]))
+                    if block not in numbers:
+                        numbers[block] = len(numbers)
+                        phase = since[first[k]] % period[session]
+                        folds.append(int(phase / length[session]) % settings.folds)
+                    known[k] = numbers[block]
+                found[mine] = known[place]
+            ids[side] = found
+        self.blocks = len(numbers)
+        self.block_session = np.array([session for session, _ in numbers], dtype=np.int64)
+        self.block_start = np.array([start[k] + b * length[k] for k, b in numbers])
+        self.fold = np.array(folds, dtype=np.int64)
+        self.parts = (np.unique(self.fold)[:, None] == self.fold).astype(float)
+        if len(set(folds)) < 2:
+            raise DataError("the sessions are too short to hold a part of them back; record at least 5 s")
+        self._block = ids
+        self._order: dict[str, slice | NDArray[np.int64]] = {}
+        self._starts: dict[str, NDArray[np.int64]] = {}
+        for side, found in ids.items():
+            fitted = np.flatnonzero(found >= 0)
+            order = fitted[np.argsort(found[fitted], kind="stable")]
+            even = len(order) > 0 and bool(np.all(np.diff(order) == 1))
+            self._order[side] = slice(int(order[0]), int(order[-1]) + 1) if even else order
+            counts = np.bincount(found[fitted], minlength=self.blocks)
+            self._starts[side] = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+    # ---- products ----
+
+    def _base_products(self) -> None:
+        p = self.base_count
+        self._base_gram = np.zeros((self.blocks, p, p))
+        self._base_target = np.zeros((self.blocks, p))
+        self.energy = np.zeros(self.blocks)
+        for key, matrix in self._columns.items():
+            weight, t = self._weights[key], self._targets[key]
+            on, starts = self._acting[key], self._starts[key[0]]
+            for block, (first, last) in enumerate(pairwise(starts.tolist())):
+                own, torque = matrix[first:last], t[first:last, 0]
+                self._base_gram[block, on[:, None], on] += weight * (own.T @ own)
+                self._base_target[block, on] += weight * (own.T @ torque)
+                self.energy[block] += weight * float(torque @ torque)
+
+    def _places(self) -> Iterator[tuple[slice, Rows]]:
+        """The further columns with their places behind the base."""
+        place = self.base_count
+        for rows in self.extra:
+            yield slice(place, place + width_of(rows)), rows
+            place += width_of(rows)
+
+    def coefficients(self) -> list[Floats]:
+        """Values (k,) of each group of further columns in the full fit."""
+        return [self.full.values[place].copy() for place, _ in self._places()]
+
+    def _gram(self) -> None:
+        """Products of base and further columns, and the fits with and without each part of the motion."""
+        p = self.base_count
+        size = p + sum(width_of(rows) for rows in self.extra)
+        self.gram, self.target = np.zeros((self.blocks, size, size)), np.zeros((self.blocks, size))
+        self.gram[:, :p, :p], self.target[:, :p] = self._base_gram, self._base_target
+        for here, rows in self._places():
+            _, padded, products = self._known[id(rows)]
+            self.gram[:, here, :p] = products.base
+            self.gram[:, :p, here] = products.base.transpose(0, 2, 1)
+            self.target[:, here] = products.target
+            for there, other in self._places():
+                if there.start <= here.start:
+                    cross = self._cross(padded, self._known[id(other)][1])
+                    self.gram[:, here, there] = cross
+                    self.gram[:, there, here] = cross.transpose(0, 2, 1)
+        self._scale = scale_of(np.einsum("bii->i", self.gram))
+        self._part_gram, self._part_target = block_sums(self.parts, self.gram), self.parts @ self.target
+        gram, target = self._part_gram.sum(axis=0), self._part_target.sum(axis=0)
+        self.full = self._fit(gram, target)
+        self._free = None
+        if self.drawn:
+            self._free = self._fit(gram, target, with_prior=False)
+        held = [
+            self._fit(gram - g, target - t) for g, t in zip(self._part_gram, self._part_target, strict=True)
+        ]
+        self._held = Fit(np.array([fit.values for fit in held]), np.array([fit.inverse for fit in held]))
+        left = self._part_gram @ self._held.values[:, :, None]
+        self._part_moment = self._part_target - left[:, :, 0]
+
+    @property
+    def drawn(self) -> bool:
+        """Whether the prior is the arm's drawing, and not a healthy arm or the bounds of its friction alone."""
+        known = self.prior is not None and not self.compared
+        return known and not lacking_bodies(self.nominal.structure.chain)
+
+    def _fit(
+        self, gram: Floats, target: Floats, *, with_prior: bool = True, pulls: Floats | None = None
+    ) -> Fit:
+        """Values from sums of products, `with_prior` if there is one; pulls : (P,) precision of columns around zero."""
+        s = self._scale
+        gram, target = gram.copy(), target.copy()
+        if pulls is not None:
+            gram[np.diag_indices_from(gram)] += pulls
+        if self.prior is not None and with_prior:
+            p = self.base_count
+            gram[:p, :p] += self.prior[0]
+            target[:p] += self.prior[0] @ self.prior[1]
+        inverse = inverse_of(gram, s)
+        return Fit(inverse @ target, inverse)
+
+    def padded(self, rows: Rows) -> dict[Key, Floats]:
+        """Columns (r, k) in the order of the blocks, zero in unused rows."""
+        return {key: values[self._order[key[0]]] * self.mask[key] for key, values in rows.items()}
+
+    def products(self, columns: _Columns, known: Products | None = None) -> Products:
+        """Products in each block of padded columns (r, k), or of those that a function makes on demand; `known` : those
+        with the base alone, which remember the ones with further columns."""
+        known = self.alone(_made(columns)) if known is None else known
+        if not self.extra:
+            return known
+        missing = [rows for rows in self.extra if id(rows) not in known.crossed]
+        if missing:
+            sums, place = block_sums(self.parts, self._cross(_made(columns), self._together(missing))), 0
+            for rows in missing:
+                known.crossed[id(rows)] = sums[:, :, place : place + width_of(rows)]
+                place += width_of(rows)
+        further = partial(self._further, columns, list(self.extra))
+        sums = np.concatenate([known.crossed[id(rows)] for rows in self.extra], axis=2)
+        return replace(known, further=further, further_sums=sums)
+
+    def _further(self, columns: _Columns, groups: Sequence[Rows]) -> Floats:
+        """Products (blocks, k, w) of padded columns with groups of further columns."""
+        return self._cross(_made(columns), self._together(groups))
+
+    def _together(self, groups: Sequence[Rows]) -> dict[Key, Floats]:
+        """Groups of further columns side by side, padded, by key."""
+        names = tuple(map(id, groups))
+        if names not in self._joined:
+            joined, size, place = dict[Key, Floats](), sum(map(width_of, groups)), 0
+            for rows in groups:
+                for key, values in self._known[id(rows)][1].items():
+                    wide = joined.setdefault(key, np.zeros((len(values), size)))
+                    wide[:, place : place + width_of(rows)] = values
+                place += width_of(rows)
+            self._joined[names] = joined
+        return self._joined[names]
+
+    def replace(self, extra: Sequence[Rows]) -> None:
+        """Replace the columns beyond the base."""
+        if [*map(id, extra)] == [*map(id, self.extra)]:
+            return
+        self.extra = list(extra)
+        self._joined.clear()
+        for rows in self.extra:
+            if id(rows) not in self._known:
+                padded = self.padded(rows)
+                # The rows are kept too, so that their identity stays theirs.
+                self._known[id(rows)] = (rows, padded, self.alone(padded))
+        self._gram()
+
+    def _cross(self, a: Mapping[Key, Floats], b: Mapping[Key, Floats]) -> Floats:
+        """Products (blocks, k, l) of two groups of padded columns."""
+        k, width = (width_of(a), width_of(b)) if b else (0, 0)
+        total, places = np.zeros((self.blocks, k, width)), np.arange(width)
+        # In a fixed order: the last digits of a sum depend on it.
+        for key in sorted(a.keys() & b.keys()):
+            add_products(a[key], b[key], self._starts[key[0]], self._weights[key], places, total)
+        return total
+
+    def alone(self, columns: Mapping[Key, Floats]) -> Products:
+        """Products of padded columns with the base, themselves and the torques."""
+        width = width_of(columns)
+        base = np.zeros((self.blocks, width, self.base_count))
+        own = np.zeros((self.blocks, width, width))
+        target = np.zeros((self.blocks, width, 1))
+        places = np.arange(width)
+        for key, wide in columns.items():
+            starts, weight = self._starts[key[0]], self._weights[key]
+            add_products(wide, self._columns[key], starts, weight, self._acting[key], base)
+            add_products(wide, wide, starts, weight, places, own)
+            add_products(wide, self._targets[key], starts, weight, places[:1], target)
+        return Products(base, own, target[:, :, 0], self.parts)
+
+    def information(self, products: Products) -> float:
+        """Mean fall of the chi-square for a unit of a group's coefficients beside the base parameters alone."""
+        left = left_beside(products.alone.sum(axis=0), products.own.sum(axis=0), self._base_inverse)
+        return float(np.mean(np.maximum(left, 0.0)))
+
+    @cached_property
+    def _base_inverse(self) -> Floats:
+        """Inverse (p, p) of the base's products, with the prior."""
+        gram = self._base_gram.sum(axis=0)
+        if self.prior is not None:
+            gram = gram + self.prior[0]
+        return inverse_of(gram, scale_of(np.diag(gram)))
+
+    # ---- scores ----
+
+    def score(
+        self,
+        columns: Mapping[Key, Floats],
+        *,
+        ridge: float = 0.0,
+        pull: float = 0.0,
+        known: Products | None = None,
+    ) -> Score:
+        """Score of padded columns.
+
+        ridge : pull towards zero, in units of the columns' mean square, for groups of many columns. pull : precision
+        of coefficients known to be 1, for the parts held back: an effect of a few moments hardly exists without one
+        of them.
+        known : their products with the base alone, to save time.
+        """
+        return self.score_products(self.products(columns, known), list(columns), ridge=ridge, pull=pull)
+
+    def score_rows(self, rows: Rows, known: Products, *, pull: float = 0.0) -> Score:
+        """Score of rows with known products with the base alone."""
+        return self.score_products(self.products(partial(self.padded, rows), known), list(rows), pull=pull)
+
+    def score_products(
+        self, products: Products, keys: Sequence[Key], *, ridge: float = 0.0, pull: float = 0.0
+    ) -> Score:
+        """Score of columns in the rows of `keys` from their products with all present columns."""
+        base, own, target = products.sums
+        whole = base.sum(axis=0), own.sum(axis=0), target.sum(axis=0)
+        one = whole[0][None], whole[1][None], whole[2][None]
+        (projection,), (inner,), (moment,), (sound,) = schur(one, self.full, ridge)
+        k = products.own.shape[1]
+        if not sound:
+            return Score(-np.inf, 0.0, np.zeros(k), 0.0, lambda: (np.eye(k), 0), 1.0)
+        coefficients = inner @ moment
+        fitted = float(moment @ coefficients)
+        gain = fitted
+        if fitted > _NO_EVIDENCE:
+            rest = whole[0] - base, whole[1] + pull * np.eye(k) - own, whole[2] + pull - target
+            gain = self._held_gain(products.sums, rest, ridge)
+        rows = sum(self._independent[key] for key in keys)
+        if self.prior is not None and self.compared and fitted > _NO_EVIDENCE:
+            changed = self.full.values - projection @ coefficients
+            gain += self._prior_penalty(self.full.values) - self._prior_penalty(changed)
+        # Held-back error can also fall after a poor fit of the base without the part: never more than the
+        # fitted gain.
+        gain = min(gain, fitted)
+        if self._free is not None:
+            # A cause explained by base parameters without the prior could only make up for a wrong drawing.
+            left = left_beside(whole[0], whole[1], self._free.inverse)
+            gain = min(gain, 0.0) if np.all(left < _OWN_SHARE * np.diag(whole[1])) else gain
+        values, gram, torque = self.full.values - projection @ coefficients, self.gram, self.target
+
+        def robust() -> tuple[Floats, int]:
+            own = products.target - products.base @ values - products.own @ coefficients
+            left = torque - gram @ values - np.einsum("bkp,k->bp", products.base, coefficients)
+            scores = own - left @ projection
+            size = np.einsum("bkk->b", products.own)
+            active = int(np.sum(size > 1e-3 * size.max(initial=0.0)))
+            middle = active / max(active - 1, 1) * scores.T @ scores
+            return widened(inner @ middle @ inner, inner), active
+
+        return Score(gain, fitted, coefficients, gain / max(rows, 1.0), robust)
+
+    def fitted(self, products: Products, on: Floats) -> Floats:
+        """Fall (m,) of the chi-square on the fitted rows by columns in m choices of the blocks, `on` (m, blocks)."""
+        base, own, target = block_sums(on, products.base), block_sums(on, products.own), on @ products.target
+        _, inner, moment, _ = schur((base, own, target), self.full, 0.0)
+        return np.asarray(np.einsum("mk,mkl,ml->m", moment, inner, moment))
+
+    def event_score(self, score: Score, choices: int) -> Score:
+        """Score of columns active in a few blocks, the best of `choices`: the fall on the fitted rows less its
+        expectation for the best of so many by chance."""
+        k = len(score.coefficients)
+        penalty = 2.0 * np.log(max(choices, 1)) + 4.0 * k
+        p = float(min(1.0, choices * chi_square_tail(score.fitted, k)))
+        gain = score.fitted - penalty if np.isfinite(score.gain) else -np.inf
+        return replace(score, gain=gain, chance=p)
+
+    def _held_gain(self, mine: Sums, rest: Sums, ridge: float) -> float:
+        """Fall of the chi-square on each part of the motion, the columns fitted on the rest; the sum of all parts."""
+        projection, inner, moment, _ = schur(rest, self._held, ridge)
+        cross, own, target = mine
+        c = inner @ moment[:, :, None]
+        change = -(projection @ c)
+        own_moment = target[:, :, None] - cross @ self._held.values[:, :, None]
+        linear = 2.0 * (np.sum(change[:, :, 0] * self._part_moment) + np.sum(c * own_moment))
+        square = np.sum(change * (self._part_gram @ change)) + np.sum(c * (2.0 * (cross @ change) + own @ c))
+        return float(linear - square)
+
+    def _prior_penalty(self, values: Floats) -> float:
+        if self.prior is None:
+            return 0.0
+        difference = values[: self.base_count] - self.prior[1]
+        return float(difference @ self.prior[0] @ difference)
+
+    # ---- results of a fit ----
+
+    def block_of(self, side: str) -> NDArray[np.int64]:
+        """Number (m,) of the block of each row of a side, -1 for held-out rows."""
+        return self._block[side]
+
+    def residuals(self, *, test: bool = False) -> dict[str, Floats]:
+        """Residual (m, n) by side with the present columns, NaN in unused rows; `test` : of held-out rows instead."""
+        found = {}
+        for side, rows in self.nominal.rows.items():
+            keep = rows.valid & (rows.test if test else ~rows.test)[:, None]
+            keep &= np.array([self.mask[side, j].any() for j in range(rows.target.shape[1])])
+            predicted = self.predicted(side, self.full.values)
+            found[side] = np.where(keep, rows.target - predicted, np.nan)
+        return found
+
+    def held_residuals(self) -> dict[str, Floats]:
+        """Residual (m, n) by side of each part of the motion, predicted from the others."""
+        found = {}
+        for side, rows in self.nominal.rows.items():
+            out = np.full(rows.target.shape, np.nan)
+            for part, values in zip(self.parts, self._held.values, strict=True):
+                mine = (part > 0.0)[self._block[side]]
+                out[mine] = rows.target[mine] - self.predicted(side, values, mine)
+            found[side] = np.where(rows.valid & ~rows.test[:, None], out, np.nan)
+        return found
+
+    def predicted(self, side: str, values: Floats, mine: NDArray[np.bool_] | None = None) -> Floats:
+        """Torques (rows, n) [Nm] of the rows `mine` (m,), default all, with values (P,) of the present columns."""
+        p, some = self.base_count, slice(None) if mine is None else mine
+        predicted = np.stack([table[some] @ values[:p] for table in self.nominal.rows[side].matrix], axis=1)
+        for here, rows in self._places():
+            for (of_side, j), columns in rows.items():
+                if of_side == side:
+                    predicted[:, j] += columns[some] @ values[here]
+        return predicted
+
+    def covariance(self, fit: Fit | None = None) -> Floats:
+        """Covariance (P, P) of all present columns in a fit, default the full one, from blocks, at least that of
+        independent rows."""
+        fit = fit or self.full
+        scores = self.target - self.gram @ fit.values
+        # A product with its own transpose keeps every variance above zero by rounding, and every correlation below one.
+        moved = np.sqrt(self.blocks / max(self.blocks - 1, 1)) * scores @ fit.inverse
+        sandwich = moved.T @ moved
+        return widened(sandwich, fit.inverse)
+
+    def free(self, around_zero: Sequence[Rows] = (), std: float = 0.0) -> tuple[Floats, Floats]:
+        """Base parameters (p,) by these sessions alone, without the prior, and their covariance (p, p).
+
+        around_zero : groups of the present columns whose coefficients have the mean zero and the standard deviation
+        `std`.
+        """
+        pulls = np.zeros(len(self._scale))
+        known = {id(rows) for rows in around_zero}
+        for place, rows in self._places():
+            if id(rows) in known:
+                pulls[place] = std**-2.0
+        gram, target = self._part_gram.sum(axis=0), self._part_target.sum(axis=0)
+        fit = self._fit(gram, target, with_prior=False, pulls=pulls)
+        p = self.base_count
+        uncertain = (fit.inverse * pulls) @ fit.inverse
+        return fit.values[:p], (self.covariance(fit) + uncertain)[:p, :p]
+
+    def free_inverse(self) -> Floats:
+        """Inverse (p, p) of the base's products without the prior: times those of a column, the change of the base
+        parameters that takes it up."""
+        gram = self._base_gram.sum(axis=0)
+        return inverse_of(gram, self._scale[: self.base_count])
+
+    @property
+    def chi_square(self) -> float:
+        """Sum of squares of all fitted rows, in units of their noise."""
+        v = self.full.values
+        return float(self.energy.sum() - 2.0 * v @ self.target.sum(axis=0) + v @ self.gram.sum(axis=0) @ v)
+
+
+def _made(columns: _Columns) -> Mapping[Key, Floats]:
+    return columns() if callable(columns) else columns

@@ -1,0 +1,1 @@
+"""The healthy arm: its baseline, the bench of sessions beside it, its commissioning."""

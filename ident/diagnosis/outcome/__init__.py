@@ -1,0 +1,1 @@
+"""A diagnosis as a value, in words, and with its look-alikes."""

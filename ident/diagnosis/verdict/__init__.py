@@ -1,0 +1,1 @@
+"""From claims to the diagnosis: tests on held-out rows, confidence, models."""

@@ -1,0 +1,166 @@
+"""Wear: drive parameters of the sessions beside those of the healthy arm.
+
+A change of friction or drive inertia leaves no residual, for the base parameters absorb it. Against a reference it
+shows in the parameters themselves: estimated by these sessions alone, beside all claims, their difference from the
+healthy ones is compared with both uncertainties and with the arm's changes from day to day (`day_spread.habit`), joint
+by joint (Hotelling's T^2). What a claim on the same torque moves in these parameters is no evidence, for its law and
+theirs share the friction between them; nor is a change beside a larger remainder without a name: what leaves the
+remainder bends the parameters, too. The sensors' gains differ from day to day, and a relative error of a joint's two
+channels looks like friction and inertia: these gains are estimated beside, around zero. Friction at another level in
+all sessions may be worn or warmer; the same motion cold and warm decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ident.diagnosis.causes.probes import Remainder, find_remainders
+from ident.diagnosis.causes.selection import Claim
+from ident.diagnosis.causes.tolerances import gain_rows
+from ident.diagnosis.gain.held_out import HeldOut
+from ident.diagnosis.gain.products import Floats, Rows
+from ident.diagnosis.healthy.bench import DiagnosisBench
+from ident.diagnosis.healthy.reference import INERTIA_BY_PHASE, Reference
+from ident.diagnosis.outcome.result import Evident, Finding, Value
+from ident.diagnosis.verdict.confidence import HARDLY
+from ident.effects import FRICTION_TEMPERATURE, WEAR
+from ident.effects.course import Course
+from ident.estimators.estimate import fisher_tail
+
+_PARAMETERS = {"Fcm": "coulomb", "Fvm": "viscous", "Ia": "inertia"}
+# Largest probability of such a change in one of the joints on a healthy arm.
+_ONE_IN = 0.01
+# Least relative change that matters to a user, of the largest parameter.
+_MATTERS = 0.03
+# Healthy arms for an arm with wear, before the data.
+_RARE = 10.0
+# Least change of a drive's inertia for a claim of its own, in standard deviations.
+_CLEAR = 4.0
+# Confidence in wear of friction alone: a drive warmer or colder in all sessions looks the same. And in that of an
+# inertia with an unknown stiffness of the joints, whose share in it changes with the motion.
+_WORN_OR_WARM = 0.75
+_TELL_APART = "the same motion with joint {joint} cold and warm: wear stays, warmth goes"
+
+
+def is_level(claim: Claim) -> bool:
+    """Whether a claim is friction at another level in all sessions: told as wear."""
+    same = claim.trial.candidate.cause == FRICTION_TEMPERATURE.cause
+    return same and claim.trial.shape.form is Course.SINCE_REFERENCE
+
+
+def wear(
+    bench: DiagnosisBench,
+    reference: Reference,
+    after: HeldOut,
+    claimed: Sequence[Rows],
+    tolerated: Sequence[Rows],
+    remainders: Sequence[Remainder],
+) -> list[Finding]:
+    """Findings of changed drives beside claimed and tolerated columns. after : held-out rows with the claims."""
+    nominal, evidence = bench.nominal, bench.evidence
+    prior = reference.prior(nominal.base, nominal.masses, wider=1.0)
+    if prior is None or not reference.sets or "motor" not in nominal.rows:
+        return []
+    precision, healthy = prior
+    known = np.flatnonzero(np.diag(precision) > 0.0)
+    spread = np.zeros_like(precision)
+    spread[np.ix_(known, known)] = np.linalg.inv(precision[np.ix_(known, known)])
+    gains = list(gain_rows(bench.dictionary).values())
+
+    def alone(beside: Sequence[Rows]) -> tuple[Floats, Floats]:
+        """Parameters by these sessions beside some claims, and their covariance."""
+        evidence.replace([*beside, *tolerated, *gains])
+        return evidence.free(gains, reference.gain_std)
+
+    # The shares are those of the friction as a whole.
+    whole = nominal.whole_friction(healthy)
+    values, covariance = alone(claimed)
+    # Motor torques sampled at another phase of the commands show another inertia.
+    other = ("Ia",) if nominal.arm.motor_delay_s != reference.motor_delay_s else ()
+    found = []
+    moving = np.flatnonzero(nominal.moving)
+    for joint in moving.tolist():
+        names = {
+            f"{symbol}{joint + 1}": label for symbol, label in _PARAMETERS.items() if symbol not in other
+        }
+        places = [k for k in known.tolist() if nominal.base.names[k] in names and whole[k] > 0.0]
+        if not places:
+            continue
+        change = values[places] - healthy[places]
+        own = covariance[np.ix_(places, places)] + spread[np.ix_(places, places)]
+        others = [rows for rows in claimed if ("motor", joint) not in rows]
+        if len(others) < len(claimed):
+            moved = values[places] - alone(others)[0][places]
+            own = own + np.outer(moved, moved)
+        if nominal.slow_motor_samples:
+            # The phase of slow samples differs from day to day, evenly.
+            drive = np.array([nominal.base.names[k].startswith("Ia") for k in places])
+            own = own + np.diag(np.where(drive, INERTIA_BY_PHASE * whole[places], 0.0) ** 2 / 3.0)
+        square = float(change @ np.linalg.solve(own, change))
+        freedom = max(float(reference.sets * len(moving)), 2.0)
+        p_value = min(1.0, len(moving) * fisher_tail(square / len(places), len(places), freedom))
+        share, std = change / whole[places], np.sqrt(np.diag(own)) / whole[places]
+        if p_value > _ONE_IN or np.max(np.abs(share)) < _MATTERS:
+            continue
+        labels = [names[nominal.base.names[k]] for k in places]
+        sizes = dict(zip(labels, np.abs(share / std).tolist(), strict=True))
+        elastic = bool(nominal.arm.compliance[joint] > 0.0)
+        heavier = sizes.get("inertia", 0.0) > max(_CLEAR, 0.5 * max(sizes.values()))
+        torque = nominal.rows["motor"].matrix[joint][:, places] @ change
+        columns = [*claimed, *tolerated, {("motor", joint): torque[:, None]}]
+        rest = _left(bench, reference, columns, remainders, joint)
+        sure = max(1.0 - rest / square, 0.0) / (1.0 + _RARE * p_value)
+        if sure < HARDLY:
+            continue
+        before, rms = _errors(bench, after, joint, np.array(places), change)
+        found.append(
+            Finding(
+                WEAR,
+                "motor",
+                (joint + 1,),
+                {
+                    label: Value(float(value), float(s), "1")
+                    for label, value, s in zip(labels, share, std, strict=True)
+                },
+                Evident(-square, p_value, before, rms, (before - rms, before - rms), (("motor", joint + 1),)),
+                sure if heavier and elastic else min(sure, _WORN_OR_WARM),
+                () if heavier else ((FRICTION_TEMPERATURE.cause, (joint + 1,), -square),),
+                _TELL_APART.format(joint=joint + 1),
+                square,
+            )
+        )
+    return found
+
+
+def _left(
+    bench: DiagnosisBench,
+    reference: Reference,
+    columns: Sequence[Rows],
+    remainders: Sequence[Remainder],
+    joint: int,
+) -> float:
+    """Gain of the remainders in a joint's motor torque beside columns with its wear."""
+
+    def mine(found: Sequence[Remainder]) -> float:
+        return sum(r.gain for r in found if (r.side, r.joint - 1) == ("motor", joint))
+
+    if not mine(remainders):
+        return 0.0
+    evidence = bench.evidence
+    evidence.replace(columns)
+    return mine(find_remainders(bench.dictionary, evidence, evidence.settings, reference.limits()))
+
+
+def _errors(
+    bench: DiagnosisBench, after: HeldOut, joint: int, places: Floats, change: Floats
+) -> tuple[float, float]:
+    """Error [Nm] of the joint's motor torque on held-out rows with the healthy drive, and with the one found."""
+    residual = after.residual["motor"][:, joint]
+    keep = np.isfinite(residual)
+    if not keep.any():
+        return 0.0, 0.0
+    torque = bench.nominal.rows["motor"].matrix[joint][keep][:, places.astype(int)] @ change
+    rms = float(np.sqrt(np.mean(residual[keep] ** 2)))
+    return float(np.sqrt(np.mean((residual[keep] + torque) ** 2))), rms

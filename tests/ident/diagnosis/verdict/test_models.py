@@ -1,0 +1,75 @@
+"""The models of a diagnosis hold what lasts, and the drives' friction as the rows had it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ident.diagnosis.causes.selection import Selection
+from ident.diagnosis.rows.nominal_arm import NominalArm
+from ident.diagnosis.verdict.models import lasting, turning_friction
+from ident.effects import PRESLIDING, entry_of
+
+
+def selection(**tolerated: tuple[float, float]) -> Selection:
+    names = {name.replace("_", " "): value for name, value in tolerated.items()}
+    return Selection([], names, {}, [{} for _ in names])
+
+
+def test_a_model_stays_beside_delays_stiffness_and_clear_gains_alone() -> None:
+    tolerated = selection(
+        motor_delay=(1e-3, 1e-4),
+        compliance_2=(1e-5, 1e-6),
+        gain_1=(0.02, 0.001),
+        gain_2=(0.02, 0.015),
+        gain_3=(0.001, 1e-5),
+        presliding_4=(0.3, 0.1),
+        habit_1=(0.8, 0.1),
+    )
+    assert list(lasting(tolerated)) == ["motor delay", "compliance 2", "gain 1"]
+
+
+def bench(rows: tuple[str, ...], far_share: float = 0.0) -> Any:
+    arm = NominalArm(
+        None,  # type: ignore[arg-type]
+        np.zeros(2),
+        np.ones(2),
+        presliding=np.array([0.0, 0.01]),
+        far=np.array([0.0, 0.1]),
+        far_share=np.array([0.0, far_share]),
+    )
+    return SimpleNamespace(nominal=SimpleNamespace(arm=arm, rows=dict.fromkeys(rows)))
+
+
+def model(link: float, motor: float) -> Any:
+    return SimpleNamespace(drive=lambda: {"Fcl": np.array([1.0, link]), "Fcm": np.array([1.0, motor])})
+
+
+def sizes(entries: list[dict[str, Any]]) -> list[tuple[float, float]]:
+    assert all(e["cause"] == PRESLIDING.cause and e["joints"] == [2] for e in entries)
+    return [(e["parameters"]["amplitude"]["value"], e["parameters"]["length"]["value"]) for e in entries]
+
+
+def test_the_friction_of_a_drive_turns_over_the_length_of_these_days() -> None:
+    entries = turning_friction(
+        model(0.5, 4.0), bench(("joint", "motor")), selection(presliding_2=(np.log(1.5), 0.1)), ()
+    )
+    assert sizes(entries) == [pytest.approx((4.0, 0.015))]
+
+
+def test_without_joint_torques_friction_of_link_and_drive_is_one() -> None:
+    entries = turning_friction(model(4.0, 0.0), bench(("motor",)), selection(), ())
+    assert sizes(entries) == [pytest.approx((4.0, 0.01))]
+
+
+def test_what_was_found_takes_its_part_and_the_rest_may_turn_in_two_lengths() -> None:
+    found = entry_of(PRESLIDING, [2], {"amplitude": (1.0, 0.1), "length": (0.05, 0.0)})
+    entries = turning_friction(model(0.0, 4.0), bench(("joint", "motor"), 0.25), selection(), (found,))
+    assert sizes(entries) == [pytest.approx((2.25, 0.01)), pytest.approx((0.75, 0.1))]
+
+
+def test_nothing_turns_slowly_without_motor_torques() -> None:
+    assert turning_friction(model(1.0, 1.0), bench(("joint",)), selection(), ()) == []
