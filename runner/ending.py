@@ -97,6 +97,9 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         text += f", median relative std {float(np.median(rsd)):.2g} %" if rsd else ""
         found.append(("parameters", text))
     found += estimate_lines(summary)
+    real = summary.get("feasibility")
+    if real and not real["real"] and real["possible"]:  # what is beyond chance is a warning
+        found.append(("real bodies", real["text"]))
     turning = (summary.get("choice") or {}).get("friction_turns")
     if turning:
         kinds = (("mrad", turning["length_rad"]), ("mm", turning.get("length_m") or {}))

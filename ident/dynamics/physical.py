@@ -35,6 +35,13 @@ _SQRT2 = float(np.sqrt(2.0))
 _TRIANGLE = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3))
 
 
+_TOUCH = 1e-9
+"""Weight of the bodies beside that of the base parameters, in units of the best known of these."""
+_ON_FACE = 1e-4
+"""Share of the reference below which a quantity counts as zero: the solver stops at 1e-8, and an eigenvalue there errs
+by the root of it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Projection:
     """Consistent bodies for base parameters.
@@ -110,6 +117,129 @@ def project(
     sigma = scale if covariance is None else np.sqrt(np.maximum(np.diag(np.asarray(covariance)), 0.0))
     moved = np.where(sigma > 0.0, (reached - chi) / np.where(sigma > 0.0, sigma, 1.0), 0.0)
     return Projection(x.reshape(-1, 10), reached, exact, np.zeros_like(moved) if exact else moved)
+
+
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """The real arm nearest to base parameters, in the metric of their covariance.
+
+    base : (b,) its base parameters. shift : (b,) from the given ones, in standard deviations. distance : of all
+    together, in standard deviations. conditions : number of conditions on the base parameters that it just meets.
+    """
+
+    base: Floats
+    shift: Floats
+    distance: float
+    conditions: int
+
+
+def nearest_real(
+    matrix: ArrayLike,
+    base: ArrayLike,
+    reference: ArrayLike,
+    covariance: ArrayLike,
+    *,
+    nonnegative: ArrayLike | None = None,
+    free: ArrayLike | None = None,
+) -> Nearest:
+    """The real arm nearest to base parameters::
+
+        minimise (K x + N u + F v - chi)' C^-1 (K x + N u + F v - chi)   subject to  P(x) >= 0 of every body,  u >= 0
+
+    matrix : (b, 10 k) K. base : (b,) chi. reference : (k, 10) real bodies, for scale. covariance : (b, b) C, with a
+        diagonal above zero. nonnegative : (b, m) N, of parameters with zero as their least value. free : (b, f) F.
+
+    Raises ConfigurationError for wrong shapes, DataError without a solution.
+    """
+    import clarabel
+
+    bodies = np.atleast_2d(np.asarray(reference, dtype=np.float64))
+    chi, c = np.asarray(base, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+    parts = [
+        np.asarray(part if part is not None else np.zeros((len(chi), 0)), dtype=np.float64)
+        for part in (matrix, nonnegative, free)
+    ]
+    if c.shape != (len(chi),) * 2 or any(len(part) != len(chi) for part in parts):
+        raise ConfigurationError(f"shapes do not fit: {len(chi)} base parameters, covariance {c.shape}")
+    k, n, f = parts
+    std = np.sqrt(np.diag(c))
+    white = _root_weight(std, c)
+    slope = k @ _steps(_roots(bodies))
+    size, m = 10 * len(bodies), n.shape[1]
+    # Columns without a bound are fitted beforehand: the rest is what they leave.
+    rest = np.eye(len(chi))
+    if f.shape[1]:
+        q = np.linalg.qr(white @ f)[0]
+        rest -= q @ q.T
+    columns = rest @ white @ np.hstack([slope, n])
+    missing = rest @ white @ (chi - k @ bodies.ravel())
+    own = columns[:, :size] if np.any(columns[:, :size]) else columns
+    unit = max(float(np.linalg.norm(own, axis=1).max(initial=0.0)), 1e-300)
+    length = np.concatenate([np.ones(size), np.linalg.norm(columns[:, size:], axis=0) / unit])
+    length[length <= 0.0] = 1.0
+    columns, missing = columns / length / unit, missing / unit
+    b = len(chi)
+    # The bodies' own weight only chooses among those that are equally near.
+    p = sparse.diags(np.concatenate([np.full(size, _TOUCH), np.zeros(m), np.ones(b)]))
+    a = sparse.vstack(
+        [
+            sparse.hstack([sparse.csc_matrix(columns), -sparse.identity(b)]),
+            -sparse.eye(size + m, size + m + b),
+        ],
+        format="csc",
+    )
+    identity = np.array([1.0 if i == j else 0.0 for i, j in _TRIANGLE])
+    right = np.concatenate([missing, np.tile(identity, len(bodies)), np.zeros(m)])
+    cones = [
+        clarabel.ZeroConeT(b),
+        *[clarabel.PSDTriangleConeT(4)] * len(bodies),
+        clarabel.NonnegativeConeT(m),
+    ]
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    found = clarabel.DefaultSolver(
+        sparse.csc_matrix(p), np.zeros(size + m + b), a, right, cones, settings
+    ).solve()
+    if str(found.status) not in ("Solved", "AlmostSolved"):
+        raise DataError(
+            f"no nearest bodies were found for these parameters ({found.status}); check the estimate"
+        )
+    x = np.array(found.x)
+    residual = unit * x[size + m :]
+    z, u = x[:size], x[size : size + m]
+    values = [np.eye(4) + _matrix(one) for one in z.reshape(-1, 10)]
+    bound = [*_face(values, slope), *(n[:, j] for j in range(m) if u[j] > _ON_FACE), *f.T]
+    fixed = np.array(bound).reshape(-1, b) * std
+    norms = np.linalg.norm(fixed, axis=1)
+    fixed = fixed[norms > 0.0] / norms[norms > 0.0, None]
+    conditions = b - (int(np.linalg.matrix_rank(fixed, tol=_ON_FACE)) if len(fixed) else 0)
+    shift = np.asarray(np.linalg.solve(white * std, residual), dtype=np.float64)
+    return Nearest(np.asarray(chi + std * shift), shift, float(np.linalg.norm(residual)), conditions)
+
+
+def _matrix(entries: Floats) -> Floats:
+    """(4, 4) symmetric matrix of its scaled upper triangle."""
+    matrix = np.zeros((4, 4))
+    for value, (i, j) in zip(entries, _TRIANGLE, strict=True):
+        matrix[i, j] = matrix[j, i] = value if i == j else value / _SQRT2
+    return matrix
+
+
+def _face(bodies: list[Floats], slope: Floats) -> list[Floats]:
+    """Directions (b,) in which the base parameters move freely: those of bodies within their face.
+
+    bodies : (4, 4) each, as a share of the reference. Moves U A + A' U' of a body with range U keep its rank.
+    """
+    found = []
+    for number, body in enumerate(bodies):
+        values, vectors = np.linalg.eigh(body)
+        own = vectors[:, values > _ON_FACE * max(values[-1], 1.0)]
+        for column in own.T:
+            for axis in np.eye(4):
+                move = np.outer(column, axis) + np.outer(axis, column)
+                entries = [move[i, j] * (1.0 if i == j else _SQRT2) for i, j in _TRIANGLE]
+                found.append(slope[:, 10 * number : 10 * number + 10] @ np.array(entries))
+    return found
 
 
 def reference_bodies(

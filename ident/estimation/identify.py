@@ -18,6 +18,7 @@ from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructur
 from ident.dynamics.tables import Tabular
 from ident.estimation.assumptions import Assumptions, check_assumptions, weak_parameters
 from ident.estimation.essential import Essential, EssentialSettings, find_essential
+from ident.estimation.feasibility import NEAREST_REAL, Feasibility, feasibility
 from ident.estimation.plausibility import payload_warnings, require_plausible
 from ident.estimation.session_rows import apart_in_time, session_rows, with_delays
 from ident.estimators import ESTIMATORS
@@ -106,7 +107,8 @@ class Identification(Tabular):
     prepared : the filtered sessions, without their samples. problem : the stacked regression.
     warnings : sentences for the report. choice : of the estimator, with "auto". known : of the sessions, for a further
     identification of them. effects : of the model beside its parameters (sensor gains, turning friction). marks : of
-    the rows of each session, by which a copy is known (`ident.rows.shared_rows`).
+    the rows of each session, by which a copy is known (`ident.rows.shared_rows`). feasibility : whether real bodies and
+    drives have the parameters.
     """
 
     settings: IdentificationSettings
@@ -126,6 +128,7 @@ class Identification(Tabular):
     choice: Choice | None = None
     effects: tuple[Mapping[str, Any], ...] = ()
     marks: tuple[str, ...] = ()
+    feasibility: Feasibility | None = None
 
     @cached_property
     def model(self) -> DynamicModel:
@@ -223,6 +226,7 @@ class Identification(Tabular):
             "assumptions": self.assumptions.to_dict(),
             "essential": None if self.essential is None else self.essential.to_dict(),
             "prior_only": list(self.estimate.prior_only),
+            "feasibility": None if self.feasibility is None else self.feasibility.to_dict(),
             "choice": None if self.choice is None else self.choice.to_dict(),
             "warnings": list(self.warnings),
         }
@@ -282,6 +286,8 @@ class Identification(Tabular):
         lines += ["", *self.estimate.pieces(), "", *self.assumptions.pieces()]
         if self.essential is not None:
             lines += ["", *self.essential.pieces()]
+        if self.feasibility is not None:
+            lines += ["", f"{self.feasibility}"]
         if self.warnings:
             lines += ["", *(f"warning: {warning}" for warning in self.warnings)]
         return lines
@@ -358,6 +364,9 @@ class Observed:
             *(text for session in self.prepared for text in session.warnings),
         ]
         warnings += require_plausible(problem, estimate, self.structure.chain.joint_names)
+        real = feasibility(base, estimate)
+        if real is not None and not real.possible:
+            warnings.append(f"{real}; {NEAREST_REAL}")
         warnings += payload_warnings(self.sessions, self.payloads, base, estimate, self.structure)
         warnings += [] if self.full_rank else _too_short(estimate, self.prepared)
         warnings += _excitation_warnings(problem, estimate, self.full_rank, doubted)
@@ -377,6 +386,7 @@ class Observed:
             warnings=tuple(warnings),
             known=self.known,
             marks=self.marks,
+            feasibility=real,
         )
 
 

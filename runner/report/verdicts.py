@@ -245,6 +245,13 @@ def _assumptions(results: ResultFolder) -> Verdict | None:
     return Verdict("assumptions", text, "none uncovered", "look" if violated else "good", "assumptions")
 
 
+def _real_bodies(results: ResultFolder) -> Verdict | None:
+    real = results.summary.get("feasibility")
+    if not real or not real["possible"]:  # what is beyond chance is a warning
+        return None
+    return Verdict("real bodies", real["text"], "", "good", "parameters")
+
+
 def _warnings(results: ResultFolder) -> list[Verdict]:
     """What the estimate warns of, a line each."""
     texts = results.summary.get("warnings", ())
@@ -336,6 +343,7 @@ _QUESTIONS: tuple[Callable[[ResultFolder], Verdict | None], ...] = (
     _unscored,
     _estimate,
     _assumptions,
+    _real_bodies,
     _essential,
     _payload,
     _truth,

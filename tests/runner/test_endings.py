@@ -129,6 +129,13 @@ def test_few_days_and_days_without_a_date_are_no_sign_of_health() -> None:
     assert doubts(arms[1:]) == []
 
 
+def test_parameters_of_no_real_body_have_a_line_unless_they_are_warned_of() -> None:
+    real = {"real": False, "possible": True, "text": "no real bodies: ZZ7"}
+    assert dict(numbers_of({"sessions": [], "feasibility": real}))["real bodies"] == "no real bodies: ZZ7"
+    for other in (real | {"possible": False}, real | {"real": True}):
+        assert "real bodies" not in dict(numbers_of({"sessions": [], "feasibility": other}))
+
+
 @pytest.mark.parametrize(("condition", "told"), [(68.8, "68.8"), (5.405e18, "infinite: the motion does not")])
 def test_a_condition_number_of_rounding_is_told_as_infinite(condition: float, told: str) -> None:
     assert dict(numbers_of({"sessions": [], "condition": condition}))["condition number"].startswith(told)
