@@ -41,14 +41,15 @@ logger = logging.getLogger(__name__)
 
 _LEVEL = 0.01
 """Chance of a false warning of a healthy arm, for all parameters together."""
-_EXACT = 0.01
-"""Distance of an estimate that real bodies have, but for rounding of the solver [standard deviations]."""
 _NAMED = 4
 """Parameters named in a sentence."""
 _FAR = 3.0
-"""Standard deviations below zero from which on a parameter is named."""
+"""Standard deviations from which on a parameter below zero is named, and a distance told."""
 _ROUNDING = 1e-9
 """Rounding of the regrouping."""
+
+_TOLD = 0.05
+"""Least distance with a digit."""
 
 NEAREST_REAL = (
     "for simulation and control choose the estimator `physical`, which keeps to real ones; `lwr-run export` to URDF or "
@@ -92,8 +93,8 @@ class Feasibility:
 
     @property
     def real(self) -> bool:
-        """Whether real bodies and drives have exactly these values."""
-        return self.distance < _EXACT
+        """Whether real bodies and drives have these values within the usual scatter."""
+        return self.distance < _FAR and not self.negative and self.possible
 
     @property
     def possible(self) -> bool:
@@ -114,8 +115,9 @@ class Feasibility:
         }
 
     def __str__(self) -> str:
-        if self.real and not self.negative:
-            return "real bodies and drives have these parameters"
+        if self.real:
+            far = f" within {self.distance:.1f} standard deviations" if self.distance >= _TOLD else ""
+            return f"real bodies and drives have these parameters{far}"
         parts = [str(one) for one in self.negative[:_NAMED]]
         more = len(self.negative) - _NAMED
         parts += [f"{more} more below zero"] if more > 0 else []

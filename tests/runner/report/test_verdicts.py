@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from runner.report.folder import ResultFolder
-from runner.report.verdicts import Verdict, estimate_lines, verdicts
+from runner.report.verdicts import Verdict, estimate_lines, headline, verdicts
 from runner.results import coverage, interval_holds, within
 
 SUMMARY: dict[str, Any] = {"exit_status": "success", "sessions": [], "from_logs": True}
@@ -91,6 +91,33 @@ CHOICE: dict[str, Any] = {
     "mounting": {"tilt_rad": [0.03, 0.04], "std_rad": [0.001, 0.002]},
     "urdf_doubt": "the URDF gives every link the same mass (1 kg)",
 }
+
+
+@pytest.mark.parametrize(("inside", "level"), [(100, "good"), (95, "look")])
+def test_two_of_a_hundred_estimates_beyond_3_sigma_are_chance_and_seven_are_not(
+    inside: int, level: str
+) -> None:
+    near = {"inertias": {"inside": inside, "count": 102}}
+    found = verdict("truth of the emulated arm", within_3_sigma=inside / 102, within_3_sigma_by_kind=near)
+    assert found.level == level
+
+
+def choice_of(used: str, **errors: float) -> dict[str, Any]:
+    best = min(errors, key=lambda name: errors[name])
+    candidates = [{"title": name, "held_back_percent": error} for name, error in errors.items()]
+    return {"candidates": candidates, "chosen": best, "used": used}
+
+
+def test_an_estimate_that_does_not_predict_its_own_motion_is_not_called_usable() -> None:
+    found = verdict("estimate", choice=choice_of("wls", physical=0.74, wls=50.31))
+    assert found.level == "look"
+    assert found.wanted == (
+        "below 5 % on parts of the motion held back; the estimator `auto`, or a longer or richer motion"
+    )
+    assert headline([found]) == ("look", "A doubtful run, with one thing to look at: estimate")
+    assert "auto" not in verdict("estimate", choice=choice_of("wls", physical=15.0, wls=50.0)).wanted
+    assert verdict("estimate", choice=choice_of("wls", physical=0.3, wls=0.4)).level == "good"
+    assert headline([verdict("warning", warnings=["weak"])])[1].startswith("A usable run")
 
 
 def test_the_estimate_is_named_with_its_error_beside_the_plain_ones_its_gains_and_its_tilt() -> None:
