@@ -10,10 +10,10 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ident.diagnosis.outcome.statements import Statements
 from ident.estimation.scores import by_side
+from ident.estimators.estimate import two_digits
+from ident.estimators.problem import condition_text
 from lwr_driver.listing import Piece
 from runner import status
 from runner.report.folder import ResultFolder
@@ -30,8 +30,6 @@ if TYPE_CHECKING:  # a command imports its own alone
     from lwr_driver.session.session import SessionSummary
     from runner.preflight import Preflight
 
-_SINGULAR = 1e12
-"""Condition number from which on rounding decides."""
 _AT_ONCE = 0.1
 """Path [mrad, mm] below which friction turns at once."""
 
@@ -90,11 +88,8 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         text = f"{counts['base']} estimated"
         if essential:
             text += f", {essential['count']} essential"
-        listed = (essential or {}).get("parameters") or [
-            one for one in summary["parameters"] if not essential or one["name"] in essential["names"]
-        ]
-        rsd = [one["rsd_percent"] for one in listed if one.get("rsd_percent") is not None]
-        text += f", median relative std {float(np.median(rsd)):.2g} %" if rsd else ""
+        spread = summary.get("median_rsd_percent")
+        text += f", median relative std {two_digits(spread)} %" if spread is not None else ""
         found.append(("parameters", text))
     found += estimate_lines(summary)
     real = summary.get("feasibility")
@@ -120,12 +115,8 @@ def numbers_of(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         text = ", ".join(_spread(one["estimate"], one["std"]) for one in masses)
         found.append(("payload mass", text))
     elif "condition" in summary:
-        condition = summary["condition"]
-        text = (
-            f"{condition:.4g}"
-            if condition < _SINGULAR
-            else "infinite: the motion does not show all parameters"
-        )
+        text = condition_text(summary["condition"])
+        text += ": the motion does not show all parameters" if text == "infinite" else ""
         found.append(("condition number", text))
     return found
 

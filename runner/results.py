@@ -20,7 +20,8 @@ from ident.estimation.comparison import compared
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.scores import by_side
 from ident.estimation.validate import validate
-from ident.estimators.estimate import Estimate
+from ident.estimators.estimate import Estimate, two_digits
+from ident.estimators.problem import condition_text
 from ident.model import DynamicModel
 from ident.model.model_file import write_model
 from ident.rows.filters import SignalSettings
@@ -75,10 +76,10 @@ def estimate(
 
 
 def _in_a_sentence(found: Identification) -> str:
-    spread = float(np.median(found.estimate.rsd_percent))
+    essential = "" if found.essential is None else f", {len(found.essential.names)} essential"
     return (
-        f"estimate: {len(found.estimate.names)} base parameters, condition number {found.condition_normalised:.1f}, "
-        f"median standard deviation {spread:.2g} %"
+        f"estimate: {len(found.estimate.names)} base parameters{essential}, condition number "
+        f"{condition_text(found.condition)}, median relative std {two_digits(found.median_rsd_percent)} %"
     )
 
 

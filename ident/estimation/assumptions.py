@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from ident.dynamics.parameters import Floats
 from ident.dynamics.tables import Tabular
 from ident.estimators.estimate import Estimate, chi_square_tail, fisher_tail, normal_tail, student_tail
-from ident.estimators.problem import Problem
+from ident.estimators.problem import Problem, condition_text
 from lwr_driver.listing import Listing, Piece, text_of
 
 _LEVEL = 0.01
@@ -431,7 +431,7 @@ def weak_parameters(problem: Problem, estimate: Estimate, doubted: Collection[st
 
 def _condition(problem: Problem, estimate: Estimate, doubted: Collection[str]) -> Check:
     normalised, weak = problem.normalised_condition, weak_parameters(problem, estimate, doubted)
-    finding = f"{problem.condition:.1f}, columns normalised {normalised:.1f}"
+    finding = f"{condition_text(problem.condition)}, columns normalised {condition_text(normalised)}"
     if weak:
         finding += f"; too uncertain: {', '.join(one.name for one in weak[:8])}"
     return Check(

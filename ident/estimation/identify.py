@@ -24,10 +24,10 @@ from ident.estimation.session_rows import apart_in_time, session_rows, with_dela
 from ident.estimators import ESTIMATORS
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.errors_in_variables import InstrumentalVariables
-from ident.estimators.estimate import Estimate, Estimator
+from ident.estimators.estimate import Estimate, Estimator, two_digits
 from ident.estimators.names import AUTO
 from ident.estimators.physical import cad_prior
-from ident.estimators.problem import Problem
+from ident.estimators.problem import Problem, condition_text
 from ident.model.dynamic_model import DynamicModel
 from ident.model.signals import signals_entry
 from ident.rows.content import Recall
@@ -185,6 +185,18 @@ class Identification(Tabular):
         return self.estimate.records()
 
     @property
+    def median_rsd_percent(self) -> float:
+        """Median relative standard deviation [%] of the essential parameters, in their own estimate; of all base
+        parameters where these were not sought, infinite where no parameter is left."""
+        chosen = self.estimate if self.essential is None else self.essential.estimate
+        return float(np.median(chosen.rsd_percent)) if len(chosen.names) else float("inf")
+
+    @property
+    def _condition(self) -> str:
+        plain, normalised = condition_text(self.condition), condition_text(self.condition_normalised)
+        return f"condition number {plain}, columns normalised {normalised}"
+
+    @property
     def torque_rms(self) -> dict[str, dict[str, float]]:
         """Root mean square of the residual torque [Nm] by side and joint."""
         result: dict[str, dict[str, float]] = {}
@@ -222,6 +234,7 @@ class Identification(Tabular):
             "condition": self.condition,
             "condition_normalised": self.condition_normalised,
             "parameters": self.parameters,
+            "median_rsd_percent": self.median_rsd_percent,
             "torque_rms": self.torque_rms,
             "assumptions": self.assumptions.to_dict(),
             "essential": None if self.essential is None else self.essential.to_dict(),
@@ -246,8 +259,9 @@ class Identification(Tabular):
             [
                 f"Identification of {self.robot}, Model {self.settings.model}, sessions: {len(self.prepared)}",
                 f"  parameters: {counts}"
-                + ("" if self.essential is None else f", {len(self.essential.names)} essential"),
-                f"  condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}",
+                + ("" if self.essential is None else f", {len(self.essential.names)} essential")
+                + f", median relative std {two_digits(self.median_rsd_percent)} %",
+                f"  {self._condition}",
                 f"  violated assumptions: {', '.join(violated) or 'none'}; warnings: {len(self.warnings)}",
                 *(f"  {line.strip()}" for line in repr(self.estimate).splitlines()[:6]),
             ]
@@ -278,14 +292,15 @@ class Identification(Tabular):
                     f"times counted by the motion, {session.counts['stale']} repeated samples left out"
                 )
         lines += self.known.signal_reasons
-        lines.append(
-            f"condition number {self.condition:.1f}, columns normalised {self.condition_normalised:.1f}"
-        )
+        lines.append(self._condition)
         if self.choice is not None:
             lines += ["", *self.choice.pieces()]
         lines += ["", *self.estimate.pieces(), "", *self.assumptions.pieces()]
         if self.essential is not None:
             lines += ["", *self.essential.pieces()]
+        which = "base" if self.essential is None else "essential"
+        text = f"median relative standard deviation of the {which} parameters: {two_digits(self.median_rsd_percent)} %"
+        lines += ["", text]
         if self.feasibility is not None:
             lines += ["", f"{self.feasibility}"]
         if self.warnings:

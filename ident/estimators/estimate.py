@@ -30,6 +30,11 @@ def percent(value: float, form: str) -> str:
     return f"> {MOST_PERCENT:g}" if value > MOST_PERCENT else format(value, form)
 
 
+def two_digits(value: float) -> str:
+    """A relative standard deviation [%] in two digits, without an exponent."""
+    return percent(float(f"{value:.2g}"), "g")
+
+
 @dataclass(frozen=True)
 class Covariance:
     """Covariance (p, p) of the estimate, its assumption (`kind`) and the degrees of freedom of its intervals.

@@ -28,6 +28,17 @@ _ADVICE = (
 )
 
 
+SINGULAR = 1e12
+"""Condition number from which on rounding decides."""
+
+
+def condition_text(value: float) -> str:
+    """A condition number in four digits, as a person writes it; `infinite` where rounding decides."""
+    if not value < SINGULAR:
+        return "infinite"
+    return f"{float(f'{value:.4g}'):.0f}" if value >= 1000.0 else f"{value:.4g}"
+
+
 @dataclass(frozen=True)
 class RowGroup:
     """Rows of one joint, side and session.

@@ -8,6 +8,7 @@ from html import escape
 from typing import Any
 
 from ident.diagnosis.outcome.statements import Number
+from ident.estimators.problem import condition_text
 from runner.published import SOURCE, TABLE_2
 from runner.report import tables
 from runner.report.figures import (
@@ -117,7 +118,7 @@ def table_1_section(results: ResultFolder) -> str:
         "T0 = 25 s."
     )
     sets = {"base": "all base parameters", "essential": "the essential ones of this run"}
-    others = [f"{condition[key]:.1f} over {of}" for key, of in sets.items() if condition.get(key)]
+    others = [f"{condition_text(condition[key])} over {of}" for key, of in sets.items() if condition.get(key)]
     note += f" Condition number of this run: {', '.join(others)}." if others else ""
     if _printed_truths(results)[0]:
         note += (

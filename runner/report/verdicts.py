@@ -13,6 +13,7 @@ import numpy as np
 
 from ident.diagnosis.outcome.claims_in_words import capital
 from ident.diagnosis.outcome.statements import in_short
+from ident.estimators.estimate import two_digits
 from ident.model import DynamicModel
 from runner.report.folder import Curves, ResultFolder
 
@@ -284,8 +285,8 @@ def _essential(results: ResultFolder) -> Verdict | None:
     essential = results.summary.get("essential")
     if not essential:
         return None
-    rsd = [entry["rsd_percent"] for entry in essential.get("parameters", [])]
-    spread = f", median RSD {float(np.median(rsd)):.2f} %" if rsd else ""
+    rsd = results.summary.get("median_rsd_percent")
+    spread = f", median relative std {two_digits(rsd)} %" if rsd is not None else ""
     total = results.summary["counts"]["base"]
     text = (
         f"{essential['count']} of {total} base parameters{spread}; leaving out the others costs "

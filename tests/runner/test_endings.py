@@ -129,6 +129,22 @@ def test_few_days_and_days_without_a_date_are_no_sign_of_health() -> None:
     assert doubts(arms[1:]) == []
 
 
+@pytest.mark.parametrize(
+    ("spread", "told"), [(0.3141, "0.31 %"), (217.3, "220 %"), (1e9, "> 1000 %"), (None, None)]
+)
+def test_the_spread_of_the_parameters_is_the_one_of_the_estimate(
+    spread: float | None, told: str | None
+) -> None:
+    summary = {
+        "sessions": [],
+        "counts": {"base": 9},
+        "essential": {"count": 7, "loss_percent": 0.5, "names": []},
+        "median_rsd_percent": spread,
+    }
+    text = dict(numbers_of(summary))["parameters"]
+    assert text == "9 estimated, 7 essential" + (f", median relative std {told}" if told else "")
+
+
 def test_parameters_of_no_real_body_have_a_line_unless_they_are_warned_of() -> None:
     real = {"real": False, "possible": True, "text": "no real bodies: ZZ7"}
     assert dict(numbers_of({"sessions": [], "feasibility": real}))["real bodies"] == "no real bodies: ZZ7"
@@ -136,6 +152,9 @@ def test_parameters_of_no_real_body_have_a_line_unless_they_are_warned_of() -> N
         assert "real bodies" not in dict(numbers_of({"sessions": [], "feasibility": other}))
 
 
-@pytest.mark.parametrize(("condition", "told"), [(68.8, "68.8"), (5.405e18, "infinite: the motion does not")])
+@pytest.mark.parametrize(
+    ("condition", "told"),
+    [(68.79999, "68.8"), (12345.678, "12350"), (5.405e18, "infinite: the motion does not")],
+)
 def test_a_condition_number_of_rounding_is_told_as_infinite(condition: float, told: str) -> None:
     assert dict(numbers_of({"sessions": [], "condition": condition}))["condition number"].startswith(told)

@@ -96,5 +96,5 @@ def test_errors_of_an_estimate_of_an_extreme_arm_are_no_impossibility(base: Base
         )
         warned += not found.possible
         outside += found.distance > 0.5
-    assert outside > 0.9 * draws  # noise alone moves it out of the cone
+    assert outside > 0.75 * draws  # noise alone moves it out of the cone
     assert warned <= 8  # at 1 % for either kind of warning, more than 8 have a chance of 2 %
