@@ -150,7 +150,15 @@ def import_log(
     couplings = " ".join(f"{entry.joint}:{entry.motor}" for entry in gears)
     rests = " ".join(f"{name}={value!r}" for name, value in (mapping.held or {}).items())
     periods, origin = _periods(mapping, joint, recording.notes)
-    more = {"base": base or "", "tip": tip or "", "couplings": couplings, "held": rests, "periods": origin}
+    encoder = "motor" if mapping.position.before_gear else ""
+    more = {
+        "encoder": encoder,
+        "base": base or "",
+        "tip": tip or "",
+        "couplings": couplings,
+        "held": rests,
+        "periods": origin,
+    }
     start = datetime.datetime.fromtimestamp(int(joint.times[0]) * 1e-9, datetime.UTC).isoformat()
     metadata = session_metadata(
         robot=mapping.robot,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ident.dynamics.parameters import Floats
 from ident.rows.binned import BinnedRows
+from ident.rows.filters import SignalSettings
 from ident.rows.reversals import away_from_reversals
 
 BIN_S = 0.02
@@ -72,6 +73,14 @@ class ClassRows:
 
 ByClass = dict[tuple[str, int], ClassRows]
 Masks = Mapping[tuple[str, int], NDArray[np.bool_]]
+
+
+def away(rows: ByClass, settings: SignalSettings) -> Masks:
+    """The rows away from reversals and slow motion."""
+    bins = round(settings.reversal / BIN_S)
+    beside = settings.standstill_rad_s, settings.turning
+    known = {key: own.known(bins, *beside) for key, own in rows.items()}
+    return {key: mask & rows[key].faster(settings.slow) for key, mask in known.items()}
 
 
 def blocks(times: Sequence[Floats], block_s: float) -> NDArray[np.int64]:

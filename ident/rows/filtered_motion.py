@@ -84,7 +84,10 @@ class WideMotion:
             present = ahead(torque, part.dt, settings.joint_delay)
             twist = low_pass(present / stiffness, part.dt, settings.cutoff, settings.order)
             rate, change = differentiate(twist, part.dt)
-            drive = DriveMotion(qd + rate, qdd + change)
+            if settings.encoder == "motor":
+                drive, q, qd, qdd = DriveMotion(qd, qdd), q - twist, qd - rate, qdd - change
+            else:
+                drive = DriveMotion(qd + rate, qdd + change)
         return cls(low, q, qd, qdd, torque, flagged, drive)
 
 
@@ -103,7 +106,9 @@ def recalled(
     make = partial(WideMotion.of, part, low, high, effort_flags, times, settings, stiffness)
     if high - low < part.count or 8 * effort_flags.shape[1] * part.count >= LEAST_BYTES:
         return make()
-    springs = None if stiffness is None else (settings.stiffness_nm_rad, settings.joint_delay)
+    springs = (
+        None if stiffness is None else (settings.stiffness_nm_rad, settings.encoder, settings.joint_delay)
+    )
     return recall.of(make, *same, springs, part.start, most=_MOST_MOTIONS)
 
 

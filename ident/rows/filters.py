@@ -29,6 +29,7 @@ CUTOFF_HZ, DECIMATE_HZ, REVERSAL_S = 10.0, 2.0, 0.05
 NYQUIST_SHARE = 0.2
 
 
+Encoder = Literal["link", "motor"]
 Frequency = Annotated[float, within(0.0, 1e5, "Hz", above=True)]
 _Span = Annotated[float, within(0.0, 1e5, "s")]
 DelaySetting = Annotated[float, within(-10.0, 10.0, "s")] | Literal["estimate"]
@@ -63,6 +64,8 @@ class SignalSettings:
     stiffness_nm_rad : of the joints, for the motors' motion against the links: the joint torque twists a joint, and
         the drive's friction and inertia act on the motor. Without it an elastic joint makes the motor channel look
         early by Fvm / stiffness. None: rigid joints.
+    encoder : `link` or `motor`, the side of the elastic joints that the positions come from. Those of the motors are
+        the links' plus the twist, joint torque / stiffness. None: told by the data where the stiffness is known.
     coupled : pairs of joints whose drives are coupled, see `Coupling`. Samples beside a reversal of the drive that they
         share have no part in the rows of both.
     """
@@ -85,6 +88,7 @@ class SignalSettings:
     joint_delay_s: DelaySetting = "estimate"
     delay_search_s: Annotated[float, within(0.0, 10.0, "s", above=True)] = 0.1
     stiffness_nm_rad: tuple[Annotated[float, within(0.0, 1e12, "Nm/rad", above=True)], ...] | None = None
+    encoder: Encoder | None = None
     coupled: tuple[tuple[Name, Name], ...] = ()
 
     def __post_init__(self) -> None:

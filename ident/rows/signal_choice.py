@@ -14,6 +14,7 @@ model on rows at full band, in blocks of two seconds at most: the even ones are 
   a path.
 * Slow motion is left out up to the least speed above which Coulomb friction rises no more towards rest: friction that
   falls with the speed (Stribeck) would bend the parameters.
+* The positions are the motors' where the links, taken back by the twist of the joints, predict clearly better.
 * The friction law of the model is the one with the least held-back error over all samples, reversals and standstill
   included. The rows of the estimation have it too if it predicts the samples far from reversals better than the sign:
   a law may follow the turning of friction and still bend the friction of a moving joint.
@@ -42,6 +43,7 @@ from ident.rows.class_rows import (
     ClassRows,
     Masks,
     Moments,
+    away,
     blocks,
     error,
     even,
@@ -51,6 +53,7 @@ from ident.rows.class_rows import (
 from ident.rows.content import Kept, Recall
 from ident.rows.data_quality import all_losses, passed_band
 from ident.rows.delay import DELAY_HZ
+from ident.rows.encoder_side import at_motors
 from ident.rows.filters import DECIMATE_HZ, NYQUIST_SHARE, SignalSettings, low_pass, median_step
 from ident.rows.prepare import prepare
 from ident.rows.reversals import TURNING_RAD
@@ -110,6 +113,8 @@ def choose_signals(
     payloads : mounted in each session. columns : base columns of the structure. recall : as for `prepare`.
     """
     coulomb, row_coulomb = laws
+    if settings.encoder is None and all(session.encoder == "motor" for session in sessions):
+        settings = replace(settings, encoder="motor")
     given = None not in (
         settings.cutoff_hz,
         settings.decimate_hz,
@@ -164,6 +169,8 @@ def _chosen(
         found = replace(found, turning_rad=_turning_rad(rows, found, reasons))
     if found.slow_rad_s is None:
         found = replace(found, slow_rad_s=_slow_rad_s(rows, found, reasons))
+    if found.encoder is None or (found.encoder == "motor" and found.stiffness_nm_rad is None):
+        found, rows = bench.with_encoder(found, rows, reasons)
     law, row_law = (coulomb, row_coulomb or coulomb) if coulomb else bench.laws(rows, found, reasons)
     return SignalChoice(found, law, row_law, tuple(reasons))
 
@@ -366,8 +373,8 @@ class _Bench:
         kept: ByClass = {}
         for one in ladder:
             rows = self.rows(replace(settings, cutoff_hz=one))
-            away = {key: own.known(_WINDOWS[-1] // 2, still, TURNING_RAD) for key, own in rows.items()}
-            errors.append(error(rows, fit(rows, away), away))
+            far = {key: own.known(_WINDOWS[-1] // 2, still, TURNING_RAD) for key, own in rows.items()}
+            errors.append(error(rows, fit(rows, far), far))
             # The highest so far near the least so far: no lower one can be chosen any more.
             kept = rows if errors[-1] < min(errors) + _TOLERANCE else kept
         best = int(np.argmin(errors))
@@ -380,19 +387,40 @@ class _Bench:
         reasons.append(f"positions: cut-off {chosen:g} Hz, held-back error of the base model {listed}")
         return replace(settings, cutoff_hz=chosen), kept
 
+    def with_encoder(
+        self, settings: SignalSettings, rows: ByClass, reasons: list[str]
+    ) -> tuple[SignalSettings, ByClass]:
+        """With the side of the joints that the positions come from, and the rows of it."""
+        efforts = self.structure.chain.efforts()
+        known = settings.encoder == "motor"
+        found = at_motors(self.rows, rows, replace(settings, encoder="link"), efforts)
+        if found is None or not (known or found.told):
+            return replace(settings, encoder=settings.encoder or "link"), rows
+        by = "the stated stiffness"
+        if settings.stiffness_nm_rad is None and efforts is not None:
+            twist = float(np.max(efforts / np.array(found.settings.stiffness_nm_rad)))
+            by = f"a twist of {1e3 * twist:.3g} mrad under the largest torque, for no `stiffness_nm_rad` is stated"
+        told = (
+            "as stated"
+            if known
+            else f"held-back error {_less(found.fall)} than as those of the links (p = {found.chance:.1g})"
+        )
+        reasons.append(f"positions: of the motors, {told}; the links stand behind by {by}")
+        return found.settings, found.rows
+
     def laws(self, rows: ByClass, settings: SignalSettings, reasons: list[str]) -> tuple[Coulomb, Coulomb]:
         """The friction laws of the model and of the rows."""
         still = settings.standstill_rad_s
-        away = _away(rows, settings)
+        used = away(rows, settings)
         far = {key: own.known(_WINDOWS[-1], still, TURNING_RAD) for key, own in rows.items()}
         everything = {key: own.measured for key, own in rows.items()}
-        sign = fit(rows, away)
+        sign = fit(rows, used)
         plain = error(rows, sign, everything)
         errors: dict[tuple[Coulomb, bool], float] = {}
         for width in _WIDTHS:
             law = Coulomb("tanh", width)
             smooth = self._with_law(rows, law)
-            own = fit(smooth, away)
+            own = fit(smooth, used)
             bends = error(smooth, own, far) > error(rows, sign, far)
             errors[law, bends] = error(smooth, sign if bends else own, everything)
         best, bends = min(errors, key=lambda key: errors[key])
@@ -458,7 +486,7 @@ def _less(fall: float) -> str:
 def _turning_rad(rows: ByClass, settings: SignalSettings, reasons: list[str]) -> float:
     """Path left out after a reversal [rad]."""
     paths = [settings.turning, *(path for path in _PATHS if path > settings.turning)]
-    farther = [_away(rows, replace(settings, turning_rad=path)) for path in paths]
+    farther = [away(rows, replace(settings, turning_rad=path)) for path in paths]
     place, chance = _first_alike(rows, farther, both=True)
     if place:
         reasons.append(
@@ -470,8 +498,8 @@ def _turning_rad(rows: ByClass, settings: SignalSettings, reasons: list[str]) ->
 
 def _slow_rad_s(rows: ByClass, settings: SignalSettings, reasons: list[str]) -> float:
     """Speed up to which slow motion is left out [rad/s]."""
-    away = _away(rows, settings)
-    faster = [{key: mask & rows[key].faster(speed) for key, mask in away.items()} for speed in _SPEEDS]
+    used = away(rows, settings)
+    faster = [{key: mask & rows[key].faster(speed) for key, mask in used.items()} for speed in _SPEEDS]
     place, chance = _first_alike(rows, faster, both=False)
     slow = _SPEEDS[place]
     reasons.append(
@@ -493,14 +521,6 @@ def _first_alike(rows: ByClass, masks: Sequence[Masks], *, both: bool) -> tuple[
             return place, chance
         place -= 1
     return 0, 1.0
-
-
-def _away(rows: ByClass, settings: SignalSettings) -> Masks:
-    """The rows away from reversals and slow motion."""
-    bins = round(settings.reversal / BIN_S)
-    beside = settings.standstill_rad_s, settings.turning
-    away = {key: own.known(bins, *beside) for key, own in rows.items()}
-    return {key: mask & rows[key].faster(settings.slow) for key, mask in away.items()}
 
 
 def _many(masks: Masks, whole: Masks) -> bool:

@@ -261,6 +261,11 @@ class Session:
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     missing: Missing = field(default_factory=Missing)
 
+    @property
+    def encoder(self) -> str | None:
+        """`motor` if the metadata say that the positions come from before the gear, None if they do not say."""
+        return self.metadata.get("encoder")
+
     def __repr__(self) -> str:
         data = self.metadata
         duration = f"{self.duration_s:.3f} s" if len(self.joint) else "empty"

@@ -33,12 +33,12 @@ def channel_delays(
     like a delay, has no part. Without those that the rows do not tell.
     """
     springs = None
-    if arm.encoder == "link" and np.any(arm.compliance > 0.0):
+    if np.any(arm.compliance > 0.0):
         springs = tuple((1.0 / np.maximum(arm.compliance, 1e-12)).tolist())
     wanted = IdentificationSettings(
         model=2 if any(session.motor is not None for session in sessions) else 1,
         estimator="wls",
-        signals=replace(settings.signals, stiffness_nm_rad=springs),
+        signals=replace(settings.signals, stiffness_nm_rad=springs, encoder=arm.encoder),
         coulomb=settings.law,
         row_coulomb=settings.row_law,
         couplings=arm.couplings,

@@ -148,7 +148,9 @@ def settled(
 
     couplings : of the arm. recall : as for `prepare`.
     """
-    settings = replace(settings, signals=settings.signals.of_coupled(couplings))
+    # A diagnosis tells the side of the positions itself, from sets of a healthy arm or beside other causes.
+    signals = replace(settings.signals.of_coupled(couplings), encoder="link")
+    settings = replace(settings, signals=signals)
     chosen = [session.select(chain.joint_names) for session in sessions]
     payloads = [payload_name(session) for session in chosen]
     sensed = any(bool(session.joint.effort.shape[1]) for session in chosen)
