@@ -169,7 +169,7 @@ def _chosen(
         found = replace(found, turning_rad=_turning_rad(rows, found, reasons))
     if found.slow_rad_s is None:
         found = replace(found, slow_rad_s=_slow_rad_s(rows, found, reasons))
-    if found.encoder is None or (found.encoder == "motor" and found.stiffness_nm_rad is None):
+    if found.encoder != "link":
         found, rows = bench.with_encoder(found, rows, reasons)
     law, row_law = (coulomb, row_coulomb or coulomb) if coulomb else bench.laws(rows, found, reasons)
     return SignalChoice(found, law, row_law, tuple(reasons))
@@ -391,21 +391,21 @@ class _Bench:
         self, settings: SignalSettings, rows: ByClass, reasons: list[str]
     ) -> tuple[SignalSettings, ByClass]:
         """With the side of the joints that the positions come from, and the rows of it."""
-        efforts = self.structure.chain.efforts()
-        known = settings.encoder == "motor"
-        found = at_motors(self.rows, rows, replace(settings, encoder="link"), efforts)
-        if found is None or not (known or found.told):
-            return replace(settings, encoder=settings.encoder or "link"), rows
+        motors, efforts = settings.encoder == "motor", self.structure.chain.efforts()
         by = "the stated stiffness"
+        if motors and settings.stiffness_nm_rad is not None:
+            reasons.append(f"positions: of the motors, as stated; the links stand behind by {by}")
+            return settings, rows
+        found = at_motors(self.rows, rows, replace(settings, encoder="link"), efforts)
+        if found is None or not (motors or found.told):
+            return replace(settings, encoder=settings.encoder or "link"), rows
         if settings.stiffness_nm_rad is None and efforts is not None:
             twist = float(np.max(efforts / np.array(found.settings.stiffness_nm_rad)))
             by = f"a twist of {1e3 * twist:.3g} mrad under the largest torque, for no `stiffness_nm_rad` is stated"
-        told = (
-            "as stated"
-            if known
-            else f"held-back error {_less(found.fall)} than as those of the links (p = {found.chance:.1g})"
+        told = f"held-back error {_less(found.fall)} than as those of the links (p = {found.chance:.1g})"
+        reasons.append(
+            f"positions: of the motors, {'as stated' if motors else told}; the links stand behind by {by}"
         )
-        reasons.append(f"positions: of the motors, {told}; the links stand behind by {by}")
         return found.settings, found.rows
 
     def laws(self, rows: ByClass, settings: SignalSettings, reasons: list[str]) -> tuple[Coulomb, Coulomb]:

@@ -383,6 +383,7 @@ def test_every_key_of_the_settings_reaches_the_identification(tmp_path: Path) ->
             "reversal_s": 0.03, "turning_rad": 0.002, "slow_rad_s": 0.02, "standstill_rad_s": 0.003, "known_share": 0.5,
             "stiffness_nm_rad": [10000, 9000, 8000, 8000, 7000, 6000, 5000], "outlier_scale": 6.0,
             "motor_delay_s": 0.004, "joint_delay_s": -0.001, "delay_search_s": 0.05, "coupled": [["A1", "A2"]],
+            "encoder": "motor",
         },
         "essential": {"significance": 0.05, "largest_loss_percent": 2.0, "keep": ["Fcm"], "drop": ["offl7"]},
     }  # fmt: skip

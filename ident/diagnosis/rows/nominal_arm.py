@@ -13,6 +13,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling
 from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of
 from ident.effects.motion import dahl
+from ident.rows.encoder_side import USUAL_TWIST_RAD
 
 Floats = NDArray[np.float64]
 
@@ -21,8 +22,6 @@ STATED_WITHIN = 2.0
 _ANY_WITHIN = 8.0
 # The range of a fit behind encoders at the links over that factor: it is held to nothing else there.
 _WIDER = 1.5
-# Twist of a geared joint [rad] under its largest torque: that of strain-wave gears and of torque sensors.
-_USUAL_TWIST = 0.008
 
 GAIN_STD = SENSOR_GAIN.usual_change
 """Usual standard deviation of a torque sensor's gain from day to day."""
@@ -79,7 +78,7 @@ class NominalArm:
         efforts = self.chain.efforts()
         if np.any(self.anchor > 0.0) or efforts is None:
             return self
-        return replace(self, stated=_USUAL_TWIST / efforts, within=_ANY_WITHIN)
+        return replace(self, stated=USUAL_TWIST_RAD / efforts, within=_ANY_WITHIN)
 
     @property
     def delays(self) -> dict[str, float]:

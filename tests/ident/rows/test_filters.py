@@ -31,7 +31,8 @@ def test_the_settings_begin_as_documented() -> None:
         "average_periods": False, "edge_s": None, "longest_bridge_s": 0.02, "reversal_s": None, "turning_rad": None,
         "slow_rad_s": None,
         "standstill_rad_s": 2e-3, "known_share": 0.4, "outlier_scale": 8.0, "motor_delay_s": "estimate",
-        "joint_delay_s": "estimate", "delay_search_s": 0.1, "stiffness_nm_rad": None, "coupled": (),
+        "joint_delay_s": "estimate", "delay_search_s": 0.1, "stiffness_nm_rad": None, "encoder": None,
+        "coupled": (),
     }  # fmt: skip
 
 
