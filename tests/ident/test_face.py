@@ -28,7 +28,7 @@ from ident import (
     validate,
     write_model,
 )
-from ident.diagnosis.outcome.result import Diagnosis, Evident, Finding, Unexplained, Value
+from ident.diagnosis.outcome.result import Diagnosis, Finding, FindingEvidence, Unexplained, Value
 from ident.rows import SignalSettings
 
 matplotlib.use("Agg")
@@ -163,7 +163,7 @@ def test_a_diagnosis_is_short_a_table_and_a_figure(found: Any) -> None:
         side="joint",
         joints=(4,),
         parameters={"compliance": Value(1.2e-4, 1e-5, "rad/Nm")},
-        evidence=Evident(80.0, 1e-9, 0.25, 0.21, (0.02, 0.06)),
+        evidence=FindingEvidence(80.0, 1e-9, 0.25, 0.21, (0.02, 0.06)),
         confidence=0.98,
         alternatives=(),
         tell_apart="",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -24,6 +24,9 @@ from lwr_driver.notebook import subplots
 
 SCHEMA_VERSION = 2
 
+# Probability under chance that is written for what chance does not do, such as a count.
+_BEYOND_CHANCE = 1e-12
+
 
 @dataclass(frozen=True)
 class Value:
@@ -35,7 +38,7 @@ class Value:
 
 
 @dataclass(frozen=True)
-class Evident:
+class FindingEvidence:
     """Evidence of a finding. test_rms [Nm] over `rows`, sides and joints from 1, the most affected; interval of their
     difference."""
 
@@ -45,6 +48,11 @@ class Evident:
     test_rms_after: float
     gain_interval_95: tuple[float, float]
     rows: tuple[tuple[str, int], ...] = ()
+
+    @classmethod
+    def counted(cls, delta_bic: float) -> FindingEvidence:
+        """Beyond chance without any error in rows: counted in the samples, or in the parameters."""
+        return cls(delta_bic, _BEYOND_CHANCE, 0.0, 0.0, (0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -58,10 +66,11 @@ class Finding:
     cause: str
     side: str
     joints: tuple[int, ...]
+    _: KW_ONLY
     parameters: Mapping[str, Value]
-    evidence: Evident
+    evidence: FindingEvidence
     confidence: float
-    alternatives: tuple[tuple[str, tuple[int, ...], float], ...]
+    alternatives: tuple[tuple[str, tuple[int, ...], float], ...] = ()
     tell_apart: str
     gain: float
     mode: str | None = None

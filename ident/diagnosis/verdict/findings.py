@@ -15,7 +15,7 @@ from ident.diagnosis.gain.held_out import HeldOut, interval
 from ident.diagnosis.gain.products import Floats, Key
 from ident.diagnosis.healthy.bench import DiagnosisBench
 from ident.diagnosis.healthy.reference import DELAY_STD_S
-from ident.diagnosis.outcome.result import Evident, Finding, Value
+from ident.diagnosis.outcome.result import Finding, FindingEvidence, Value
 from ident.diagnosis.rows.recording import SessionRecord, sensor_limits
 from ident.diagnosis.verdict.task import State, Task
 from ident.dynamics.parameters import joint_unit
@@ -24,6 +24,8 @@ from ident.rows.data_quality import SampleLoss
 
 # Standard deviations of a size from zero, 95 %.
 _TOLD = 2.0
+# Confidence in what is counted in the samples: no model has a part in it, only the reading of the channel.
+_COUNTED = 0.99
 
 
 def finding_of(claim: Claim, bench: DiagnosisBench, without: HeldOut, after: HeldOut, seed: int) -> Finding:
@@ -35,11 +37,11 @@ def finding_of(claim: Claim, bench: DiagnosisBench, without: HeldOut, after: Hel
     cost = np.log(sum(float(m.sum()) for m in bench.evidence.mask.values()))
     delta_bic = float(-score.fitted + len(candidate.effect.parameters) * cost)
     return Finding(
-        cause=candidate.cause,
-        side=candidate.effect.side,
-        joints=candidate.joints,
+        candidate.cause,
+        candidate.effect.side,
+        candidate.joints,
         parameters=_parameters(claim.trial, bench),
-        evidence=Evident(
+        evidence=FindingEvidence(
             delta_bic,
             score.p_value,
             rms_before,
@@ -116,12 +118,14 @@ def timing_finding(
         effect.cause,
         "timing",
         (),
-        {"delay": Value((motor if side == "motor" else joint) + rest[0], std, "s")},
-        Evident(-claim.score.fitted, claim.score.p_value, rms_before, rms_after, (low, high), rows),
-        claim.confidence,
-        tuple((c.cause, c.joints, -g) for c, g in claim.alternatives),
-        effect.tell_apart,
-        claim.gain,
+        parameters={"delay": Value((motor if side == "motor" else joint) + rest[0], std, "s")},
+        evidence=FindingEvidence(
+            -claim.score.fitted, claim.score.p_value, rms_before, rms_after, (low, high), rows
+        ),
+        confidence=claim.confidence,
+        alternatives=tuple((c.cause, c.joints, -g) for c, g in claim.alternatives),
+        tell_apart=effect.tell_apart,
+        gain=claim.gain,
     )
 
 
@@ -152,7 +156,7 @@ def in_order(findings: Sequence[Finding], floor: Mapping[str, Floats]) -> list[F
     return ordered
 
 
-def _removed(shown: Evident, floor: Mapping[str, Floats]) -> float | None:
+def _removed(shown: FindingEvidence, floor: Mapping[str, Floats]) -> float | None:
     """Power that a finding removes over that of the noise, sum over its rows; None without an error measured."""
     if not shown.rows or not shown.test_rms_before > 0.0:
         return None
@@ -168,12 +172,11 @@ def loss_finding(worst: SampleLoss) -> Finding:
         LOST_SAMPLES.cause,
         LOST_SAMPLES.side,
         (),
-        {"share": Value(worst.share, std, "1")},
-        Evident(-float(count) * worst.share, 1e-12, 0.0, 0.0, (0.0, 0.0)),
-        0.99,
-        (),
-        LOST_SAMPLES.tell_apart,
-        float(worst.amiss),
+        parameters={"share": Value(worst.share, std, "1")},
+        evidence=FindingEvidence.counted(-float(count) * worst.share),
+        confidence=_COUNTED,
+        tell_apart=LOST_SAMPLES.tell_apart,
+        gain=float(worst.amiss),
         detail=f"{worst.lost} lost, {worst.repeated} repeated and {worst.stale} stale of {count} {worst.channel} "
         f"samples in {worst.session}",
     )
@@ -196,12 +199,11 @@ def limit_findings(records: Sequence[SessionRecord], found: Sequence[Finding]) -
                 SENSOR_SATURATION.cause,
                 SENSOR_SATURATION.side,
                 (joint + 1,),
-                {"limit": Value(limit, std, "Nm")},
-                Evident(0.0, 1e-12, 0.0, 0.0, (0.0, 0.0)),
-                0.99,
-                (),
-                SENSOR_SATURATION.tell_apart.format(joint=joint + 1),
-                0.0,
+                parameters={"limit": Value(limit, std, "Nm")},
+                evidence=FindingEvidence.counted(0.0),
+                confidence=_COUNTED,
+                tell_apart=SENSOR_SATURATION.tell_apart.format(joint=joint + 1),
+                gain=0.0,
                 form=shape.form_name,
             )
         )

@@ -17,7 +17,7 @@ import numpy as np
 from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.healthy.bench import DiagnosisBench
 from ident.diagnosis.healthy.reference import WEIGHED, Reference, announced_masses, last_body
-from ident.diagnosis.outcome.result import Evident, Finding, Value
+from ident.diagnosis.outcome.result import Finding, FindingEvidence, Value
 from ident.diagnosis.verdict.confidence import LIMITS, Grounds, probability
 from ident.diagnosis.verdict.task import Task
 from ident.dynamics.base_set import BaseSet
@@ -228,12 +228,11 @@ def payload_finding(one: OtherMass | UnstatedBody) -> Finding:
         PAYLOAD_ERROR.cause,
         PAYLOAD_ERROR.side,
         (),
-        parameters,
-        Evident(-one.square, 1e-12, 0.0, 0.0, (0.0, 0.0)),
-        probability(grounds),
-        (),
-        PAYLOAD_ERROR.tell_apart,
-        one.fall,
+        parameters=parameters,
+        evidence=FindingEvidence.counted(-one.square),
+        confidence=probability(grounds),
+        tell_apart=PAYLOAD_ERROR.tell_apart,
+        gain=one.fall,
         grounds=grounds.to_dict(),
     )
 

@@ -23,7 +23,7 @@ from ident.diagnosis.gain.held_out import HeldOut
 from ident.diagnosis.gain.products import Floats, Rows
 from ident.diagnosis.healthy.bench import DiagnosisBench
 from ident.diagnosis.healthy.reference import INERTIA_BY_PHASE, Reference
-from ident.diagnosis.outcome.result import Evident, Finding, Value
+from ident.diagnosis.outcome.result import Finding, FindingEvidence, Value
 from ident.diagnosis.verdict.confidence import HARDLY
 from ident.effects import FRICTION_TEMPERATURE, WEAR
 from ident.effects.course import Course
@@ -120,15 +120,17 @@ def wear(
                 WEAR,
                 "motor",
                 (joint + 1,),
-                {
+                parameters={
                     label: Value(float(value), float(s), "1")
                     for label, value, s in zip(labels, share, std, strict=True)
                 },
-                Evident(-square, p_value, before, rms, (before - rms, before - rms), (("motor", joint + 1),)),
-                sure if heavier and elastic else min(sure, _WORN_OR_WARM),
-                () if heavier else ((FRICTION_TEMPERATURE.cause, (joint + 1,), -square),),
-                _TELL_APART.format(joint=joint + 1),
-                square,
+                evidence=FindingEvidence(
+                    -square, p_value, before, rms, (before - rms, before - rms), (("motor", joint + 1),)
+                ),
+                confidence=sure if heavier and elastic else min(sure, _WORN_OR_WARM),
+                alternatives=() if heavier else ((FRICTION_TEMPERATURE.cause, (joint + 1,), -square),),
+                tell_apart=_TELL_APART.format(joint=joint + 1),
+                gain=square,
             )
         )
     return found

@@ -38,7 +38,17 @@ def experiment() -> Experiment:
 def finding(cause: str, joint: int, confidence: float, *others: Place) -> Finding:
     evidence: Any = SimpleNamespace()
     alternatives = tuple((name, joints, -20.0) for name, joints in others)
-    return Finding(cause, "motor", (joint,), {}, evidence, confidence, alternatives, "a motion", 40.0)
+    return Finding(
+        cause,
+        "motor",
+        (joint,),
+        parameters={},
+        evidence=evidence,
+        confidence=confidence,
+        alternatives=alternatives,
+        tell_apart="a motion",
+        gain=40.0,
+    )
 
 
 def diagnosis(*findings: Finding) -> Any:

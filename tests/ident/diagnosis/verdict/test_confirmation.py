@@ -14,7 +14,7 @@ from ident.diagnosis import diagnose
 from ident.diagnosis.causes.candidates import Candidate, Trial
 from ident.diagnosis.causes.selection import Claim
 from ident.diagnosis.gain.score import Score
-from ident.diagnosis.outcome.result import Evident, Finding, Value
+from ident.diagnosis.outcome.result import Finding, FindingEvidence, Value
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.verdict.confirmation import _refuted
 from ident.diagnosis.verdict.findings import sizeless
@@ -31,8 +31,10 @@ def refuted(
     effect = EFFECTS[cause]
     score = Score(2000.0, 2000.0, np.ones(1), 0.1, lambda: (np.eye(1), 40))
     claim = Claim(Trial(Candidate(effect, 3), Shape(), score, {}), score)
-    evidence = Evident(-2000.0, 1e-12, 0.1, after, (-0.01, 0.03))
-    finding = Finding(cause, effect.side, (4,), {}, evidence, 0.7, (), "", 2000.0)
+    evidence = FindingEvidence(-2000.0, 1e-12, 0.1, after, (-0.01, 0.03))
+    finding = Finding(
+        cause, effect.side, (4,), parameters={}, evidence=evidence, confidence=0.7, tell_apart="", gain=2000.0
+    )
     return _refuted(claim, finding, BENCH, fallen, hardly)
 
 
@@ -76,8 +78,10 @@ def test_a_cause_of_no_size_is_no_finding(
     cause: str, sizes: dict[str, tuple[float, float]], told: bool
 ) -> None:
     values = {name: Value(*size, "1") for name, size in sizes.items()}
-    evident = Evident(0.0, 1e-9, 0.1, 0.09, (0.0, 0.0), ())
-    finding = Finding(cause, "motor", (1,), values, evident, 0.9, (), "", 50.0)
+    evident = FindingEvidence(0.0, 1e-9, 0.1, 0.09, (0.0, 0.0), ())
+    finding = Finding(
+        cause, "motor", (1,), parameters=values, evidence=evident, confidence=0.9, tell_apart="", gain=50.0
+    )
     assert sizeless(finding) != told
     assert not sizeless(replace(finding, alternatives=(("contact", (), -40.0),)))
 

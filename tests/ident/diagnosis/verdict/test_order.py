@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.diagnosis.outcome.result import Evident, Finding
+from ident.diagnosis.outcome.result import Finding, FindingEvidence
 from ident.diagnosis.verdict.findings import in_order
 
 FLOOR = {"motor": np.array([0.3, 0.1]), "joint": np.array([0.1, 0.1])}
@@ -13,8 +13,10 @@ FLOOR = {"motor": np.array([0.3, 0.1]), "joint": np.array([0.1, 0.1])}
 def finding(
     name: str, before: float, after: float, *rows: tuple[str, int], gain: float = 0.0, confidence: float = 0.9
 ) -> Finding:
-    shown = Evident(0.0, 1e-9, before, after, (0.0, 0.0), rows)
-    return Finding(name, "motor", (1,), {}, shown, confidence, (), "", gain)
+    shown = FindingEvidence(0.0, 1e-9, before, after, (0.0, 0.0), rows)
+    return Finding(
+        name, "motor", (1,), parameters={}, evidence=shown, confidence=confidence, tell_apart="", gain=gain
+    )
 
 
 def test_the_power_removed_in_units_of_the_noise_comes_before_any_chi_square() -> None:
