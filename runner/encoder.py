@@ -8,17 +8,18 @@ from pathlib import Path
 
 from fri.errors import LwrError
 from ident.diagnosis.healthy.reference import Reference
+from ident.effects import EncoderSide
 from ident.model import DynamicModel
 from ident.model.model_file import read_model
 from lwr_driver.configuration import find
 from lwr_driver.references import Frozen
 from lwr_driver.session import Session
 from runner.experiment_file import Experiment
-from runner.replay import Encoder, attached_experiment
+from runner.replay import attached_experiment
 from sim_backend.configuration import load_configuration
 
 
-def encoder_of(session: Session, folder: Path, models: Iterable[DynamicModel]) -> Encoder | None:
+def encoder_of(session: Session, folder: Path, models: Iterable[DynamicModel]) -> EncoderSide | None:
     """Where the arm of a session has its encoders; None if nothing tells.
 
     Told by the settings of the emulated arm, else by its healthy baseline (`lwr-run commission`), else by an effect
@@ -39,7 +40,7 @@ def encoder_of(session: Session, folder: Path, models: Iterable[DynamicModel]) -
         if baseline.sets:
             return baseline.encoder
     for entry in (entry for model in models for entry in model.effects):
-        place: dict[str, Encoder] = {"encoder at the motor": "motor", "encoder at the link": "link"}
+        place: dict[str, EncoderSide] = {"encoder at the motor": "motor", "encoder at the link": "link"}
         if entry.get("form") in place:
             return place[entry["form"]]
     return None

@@ -18,7 +18,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -29,6 +29,7 @@ from scipy.ndimage import maximum_filter1d
 
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis import SimulationError
+from ident.effects import EncoderSide
 from ident.model import DynamicModel
 from ident.rows.filters import low_pass, median_step
 from ident.rows.sessions import payload_name
@@ -40,7 +41,6 @@ from sim_backend.plant import CYCLE_S, ElasticArm, PlantEffect, Reading
 from sim_backend.robot import Drive
 
 Floats = NDArray[np.float64]
-Encoder = Literal["link", "motor"]
 
 METHOD = {
     "torques": "simulated arm led along the measured positions; motor torques without standstill",
@@ -107,7 +107,7 @@ class Replay:
         sessions: Sequence[Session] = (),
         *,
         longest_s: float = 60.0,
-        encoder: Encoder = "link",
+        encoder: EncoderSide = "link",
     ) -> None:
         self.stiffness = stiffness
         self.longest_s = longest_s
@@ -191,7 +191,7 @@ def replay(
     longest_s: float,
     *,
     stiffness: Floats | None = None,
-    encoder: Encoder = "link",
+    encoder: EncoderSide = "link",
     number: int | None = None,
     inertia: Floats | None = None,
 ) -> Replayed:
@@ -260,7 +260,7 @@ class _Bench:
         model: DynamicModel,
         session: Session,
         stiffness: Floats | None,
-        encoder: Encoder,
+        encoder: EncoderSide,
         number: int | None,
         begin_s: float,
         inertia: Floats | None,

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
+from ident.effects import EncoderSide
 from ident.model.model_file import read_model
 from ident.rows.sessions import payload_name
 from lwr_driver.arm import Arm
@@ -25,7 +26,7 @@ from runner.encoder import encoder_of
 from runner.estimation import known_arm
 from runner.experiment_file import Payload
 from runner.file_names import MODEL, SUMMARY
-from runner.replay import Encoder, Replay, Replayed, attached_experiment
+from runner.replay import Replay, Replayed, attached_experiment
 from runner.report.folder import ResultFolder
 from runner.report.plot import STYLES
 
@@ -58,7 +59,7 @@ class MotionReplay:
     runs: Mapping[Simulated, Replayed]
     side: Literal["joint", "motor"]
     notes: tuple[str, ...] = ()
-    encoder: Encoder = "link"
+    encoder: EncoderSide = "link"
 
     @property
     def time(self) -> Floats:
@@ -161,7 +162,7 @@ def motion_replay(
             f"{source}: no arm file has these joints; name one with --arm, to draw the arm"
         )
     place = encoder_of(log, folder, models.values())
-    encoder: Encoder = place or "link"
+    encoder: EncoderSide = place or "link"
     stiffness = np.asarray(known.stiffness, dtype=float)
     replay = Replay(stiffness, others, longest_s=longest_s, encoder=encoder)
     for one in models.values():

@@ -23,6 +23,8 @@ from ident.effects.motion import ArmMotion, Floats
 from ident.effects.words import Values, quantity, spoken
 
 EffectSide = Literal["motor", "joint", "sensor", "timing"]
+EncoderSide = Literal["link", "motor"]
+"""The side of an elastic joint that its positions are of."""
 Variable = Literal["velocity", "load", "position", "time", "motor angle"]
 Parameters = Mapping[str, float]
 """Values by the names of an effect's parameters, SI units."""
@@ -183,7 +185,7 @@ class Setting:
     torque_turns: NDArray[np.bool_]
     speed_range: Floats
     position_range: Floats
-    encoder: Literal["link", "motor"] | None = None
+    encoder: EncoderSide | None = None
     presliding: Floats | None = None
     standstill_rad_s: float = 0.01
     compared: bool = False

@@ -12,6 +12,7 @@ from ident.effects.effect import (
     Column,
     Discriminator,
     Effect,
+    EncoderSide,
     Form,
     Law,
     Loads,
@@ -135,7 +136,7 @@ class JointElasticity(_Twisting):
         """In proportion to the torque."""
         return parameters["compliance"] * torque
 
-    def at_encoder(self, encoder: str) -> Shape:
+    def at_encoder(self, encoder: EncoderSide) -> Shape:
         """The shape with the encoder at the `motor` or at the `link`."""
         return Shape(_Encoder.MOTOR if encoder == "motor" else _Encoder.LINK)
 

@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,7 @@ from ident.diagnosis.rows.recording import SessionRecord, every_joint_moves, rec
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
+from ident.effects import EncoderSide
 from ident.estimation.turning import drive_coulomb
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
@@ -50,8 +51,6 @@ from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
 
 log = logging.getLogger(__name__)
-
-Side = Literal["link", "motor"]
 
 # Rounds of settling the channels' delays.
 _SETTLING = 2
@@ -132,7 +131,7 @@ def commission(
     if all(one.has_effort and one.has_motor for records in recorded for one in records):
         # One torque alone does not tell a twist from friction and inertia.
         start = start.of_unknown_stiffness()
-    sides: tuple[Side, ...] = ("link", "motor") if np.any(start.anchor > 0.0) else ("link",)
+    sides: tuple[EncoderSide, ...] = ("link", "motor") if np.any(start.anchor > 0.0) else ("link",)
     first = recorded[0]
     # Both sides in bins long enough to average the links' ringing, for a fair comparison.
     slow = replace(settings, bin_s=max(settings.bin_s, settings.ringing_s))
@@ -273,7 +272,7 @@ def _tuned(
     return _Tuned(misfit, arm, bench.compliance_std, base)
 
 
-def _encoder(arm: NominalArm, misfits: Mapping[Side, float]) -> Side:
+def _encoder(arm: NominalArm, misfits: Mapping[EncoderSide, float]) -> EncoderSide:
     """The side of the joints that the positions come from: that of the least misfit. Of an arm whose description states
     no stiffness, that of the motors has to be clearly less: a twist of any size takes something off."""
     motor = misfits.get("motor", np.inf) + (_CLEARLY if arm.within > STATED_WITHIN else 0.0)
@@ -358,18 +357,20 @@ def _day(
     residual = evidence.residuals()
     noise = {side: misfit(rows, residual[side]) for side, rows in bench.nominal.rows.items()}
     return _Day(
-        bench.nominal.base,
-        bench.nominal.masses,
-        values,
-        evidence.covariance()[:p, :p],
-        {side: sigma for side, (sigma, _) in noise.items()},
-        {side: inflation for side, (_, inflation) in noise.items()},
-        {side: np.sqrt(np.mean(rows.target**2, axis=0)) for side, rows in bench.nominal.rows.items()},
-        bench.nominal.motions[0].motor_coulomb,
-        slow_turns(bench.nominal, bench.evidence),
-        {side: mean_delay(nuisance, side) for side in CHANNELS},
-        _gains(bench, selection.nuisance_rows),
-        bench.nominal.whole_friction(values),
+        base=bench.nominal.base,
+        masses=bench.nominal.masses,
+        values=values,
+        covariance=evidence.covariance()[:p, :p],
+        sigma={side: sigma for side, (sigma, _) in noise.items()},
+        correlated={side: inflation for side, (_, inflation) in noise.items()},
+        torque_rms={
+            side: np.sqrt(np.mean(rows.target**2, axis=0)) for side, rows in bench.nominal.rows.items()
+        },
+        coulomb=bench.nominal.motions[0].motor_coulomb,
+        slow_turns=slow_turns(bench.nominal, bench.evidence),
+        late={side: mean_delay(nuisance, side) for side in CHANNELS},
+        gains=_gains(bench, selection.nuisance_rows),
+        whole=bench.nominal.whole_friction(values),
     )
 
 
@@ -454,17 +455,17 @@ def _reference(
     noise = {side: np.mean([day.sigma[side] for day in days], axis=0) for side in usual.sigma}
     return Reference(
         model,
-        arm.compliance,
-        arm.motor_delay_s,
-        arm.joint_delay_s,
-        noise,
-        {},
-        len(days),
-        arm.encoder,
-        arm.presliding,
-        arm.far,
-        arm.far_share,
-        {side: delay_std([day.late[side] for day in days]) for side in CHANNELS},
+        compliance=arm.compliance,
+        motor_delay_s=arm.motor_delay_s,
+        joint_delay_s=arm.joint_delay_s,
+        noise=noise,
+        null={},
+        sets=len(days),
+        encoder=arm.encoder,
+        presliding=arm.presliding,
+        far=arm.far,
+        far_share=arm.far_share,
+        delay_std_s={side: delay_std([day.late[side] for day in days]) for side in CHANNELS},
         habits=True,
         masses=usual.masses,
         # Of a further day against the mean of these.

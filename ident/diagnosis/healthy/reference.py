@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.rows.nominal_arm import GAIN_STD
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import LINK_FRICTION, PER_LINK, split_name
-from ident.effects import EFFECTS
+from ident.effects import EFFECTS, EncoderSide
 from ident.estimators.estimate import fisher_limit
 from ident.model import DynamicModel, write_model
 
@@ -44,6 +44,8 @@ LAST_BODY = ("M", "MX", "MY", "MZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
 """Inertial parameters of a body on the last link: those that are told first."""
 
 _KEY = "commissioning"
+# The name of the presliding lengths in files, that of the first versions.
+_LENGTHS = "reach"
 _WIDER = 1.5
 # Relative error within which a stiffness counts as known.
 _STIFFNESS_WITHIN = 0.2
@@ -72,13 +74,14 @@ class Reference:
     """
 
     model: DynamicModel
+    _: KW_ONLY
     compliance: Floats
     motor_delay_s: float
     joint_delay_s: float
     noise: Mapping[str, Floats]
     null: Mapping[tuple[str, int], float]
     sets: int
-    encoder: Literal["link", "motor"] = "link"
+    encoder: EncoderSide = "link"
     presliding: Floats | None = None
     far: Floats | None = None
     far_share: Floats | None = None
@@ -126,7 +129,15 @@ class Reference:
         n = model.structure.chain.n
         stored = model.provenance.get(_KEY)
         if not isinstance(stored, Mapping):
-            return cls(model, np.zeros(0), 0.0, 0.0, {}, {}, 0)
+            return cls(
+                model,
+                compliance=np.zeros(0),
+                motor_delay_s=0.0,
+                joint_delay_s=0.0,
+                noise={},
+                null={},
+                sets=0,
+            )
         try:
             null = {_split(key): float(value) for key, value in stored["null"].items()}
             shown = {
@@ -138,13 +149,13 @@ class Reference:
             noise, correlated, left = (
                 _by_side(stored.get(key, {})) for key in ("noise", "correlated", "left")
             )
-            delays = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
+            motor_delay_s, joint_delay_s = float(stored["motor_delay_s"]), float(stored["joint_delay_s"])
             delay_std = {side: float(v) for side, v in stored.get("delay_std_s", {}).items()}
             lost = {channel: float(v) for channel, v in stored.get("lost", {}).items()}
             sets, encoder = int(stored["sets"]), str(stored["encoder"])
             presliding, far, far_share, compliance_std = (
                 np.array(stored[name], dtype=np.float64) if stored.get(name) else None
-                for name in ("reach", "far", "far_share", "compliance_std")
+                for name in (_LENGTHS, "far", "far_share", "compliance_std")
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ConfigurationError(
@@ -159,29 +170,28 @@ class Reference:
             raise ConfigurationError(
                 f"the reference's compliance has {compliance.size} entries for {n} joints; commission again"
             )
-        side: Literal["link", "motor"] = "motor" if encoder == "motor" else "link"
-        habits, masses = bool(stored.get("habits", False)), dict(stored.get("masses", {}))
         return cls(
             model,
-            compliance,
-            *delays,
-            noise,
-            null,
-            sets,
-            side,
-            presliding,
-            far,
-            far_share,
-            delay_std,
-            habits,
-            masses,
-            float(stored.get("gain_std", GAIN_STD)),
-            compliance_std,
-            correlated,
-            shown,
-            usual,
-            left,
-            lost,
+            compliance=compliance,
+            motor_delay_s=motor_delay_s,
+            joint_delay_s=joint_delay_s,
+            noise=noise,
+            null=null,
+            sets=sets,
+            encoder="motor" if encoder == "motor" else "link",
+            presliding=presliding,
+            far=far,
+            far_share=far_share,
+            delay_std_s=delay_std,
+            habits=bool(stored.get("habits", False)),
+            masses=dict(stored.get("masses", {})),
+            gain_std=float(stored.get("gain_std", GAIN_STD)),
+            compliance_std=compliance_std,
+            correlated=correlated,
+            shown=shown,
+            usual=usual,
+            left=left,
+            lost=lost,
         )
 
     def stored(self) -> dict[str, Any]:
@@ -210,7 +220,7 @@ class Reference:
                 "masses": dict(self.masses),
                 "gain_std": self.gain_std,
                 "encoder": self.encoder,
-                "reach": _listed(self.presliding),
+                _LENGTHS: _listed(self.presliding),
                 "far": _listed(self.far),
                 "far_share": _listed(self.far_share),
             }

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling
-from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of
+from ident.effects import PRESLIDING, SENSOR_GAIN, EncoderSide, entry_of
 from ident.effects.motion import dahl
 from ident.rows.encoder_side import USUAL_TWIST_RAD
 
@@ -50,7 +50,7 @@ class NominalArm:
     gear_ratio: Floats
     motor_delay_s: float = 0.0
     joint_delay_s: float = 0.0
-    encoder: Literal["link", "motor"] = "link"
+    encoder: EncoderSide = "link"
     encoder_known: bool = False
     presliding: Floats | None = None
     far: Floats | None = None

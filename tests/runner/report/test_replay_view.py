@@ -100,7 +100,16 @@ def test_the_encoders_are_simulated_where_the_arm_has_them(finished: Path, tmp_p
     )
     assert encoder_of(real, tmp_path, [model]) is None
     n = len(model.structure.chain.joint_names)
-    healthy = Reference(model, np.full(n, 1e-4), 0.0, 0.0, {}, {}, 3, encoder="motor")
+    healthy = Reference(
+        model,
+        compliance=np.full(n, 1e-4),
+        motor_delay_s=0.0,
+        joint_delay_s=0.0,
+        noise={},
+        null={},
+        sets=3,
+        encoder="motor",
+    )
     commissioned = replace(model, provenance={**model.provenance, **healthy.stored()})
     assert encoder_of(real, tmp_path, [commissioned]) == "motor"
     gap = {

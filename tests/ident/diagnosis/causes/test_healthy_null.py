@@ -16,7 +16,7 @@ from ident.diagnosis.causes.usual_sizes import Healthy
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.healthy import bench, channel_delays
 from ident.diagnosis.healthy.channel_delays import common_delays
-from ident.diagnosis.healthy.commission import Side, _encoder, with_compliance_std
+from ident.diagnosis.healthy.commission import _encoder, with_compliance_std
 from ident.diagnosis.healthy.day_spread import compliance_std, delay_std, gain_std
 from ident.diagnosis.healthy.presliding import with_far_presliding
 from ident.diagnosis.healthy.reference import DELAY_STD_S, Reference
@@ -27,14 +27,23 @@ from ident.diagnosis.verdict.late_channels import late_by_themselves
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, ModelStructure
-from ident.effects import EFFECTS, Shape
+from ident.effects import EFFECTS, EncoderSide, Shape
 from ident.model import DynamicModel
 from ident.rows.delay import Delay
 from ident.rows.filters import SignalSettings
 
 
 def reference(model: DynamicModel, null: dict[tuple[str, int], float], sets: int) -> Reference:
-    return Reference(model, np.zeros(3), 0.0, 0.0, {}, null, sets, habits=True)
+    return Reference(
+        model,
+        compliance=np.zeros(3),
+        motor_delay_s=0.0,
+        joint_delay_s=0.0,
+        noise={},
+        null=null,
+        sets=sets,
+        habits=True,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +239,7 @@ def test_encoders_of_an_undescribed_arm_are_at_the_links_unless_the_motors_are_c
 
 
 @pytest.mark.parametrize("encoder", ["link", "motor"])
-def test_a_joint_that_hardly_moves_is_known_as_stated(arm: NominalArm, encoder: Side) -> None:
+def test_a_joint_that_hardly_moves_is_known_as_stated(arm: NominalArm, encoder: EncoderSide) -> None:
     stated, own = np.full(3, 1e-4), [np.array([1e-6, np.inf, np.inf])] * 2
     found = with_compliance_std(
         replace(arm, encoder=encoder, compliance=stated, stated=stated), [stated] * 2, own

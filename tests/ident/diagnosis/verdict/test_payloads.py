@@ -49,7 +49,17 @@ def healthy(base: BaseSet, mass: float, std: float) -> Reference:
     values, covariance = np.zeros(len(base)), 1e-6 * np.eye(len(base))
     values[place], covariance[place, place] = mass, std**2
     model = DynamicModel("arm", base.structure, base.names, values, covariance, base)
-    return Reference(model, np.zeros(3), 0.0, 0.0, {}, {}, 2, habits=True, masses=MASSES)
+    return Reference(
+        model,
+        compliance=np.zeros(3),
+        motor_delay_s=0.0,
+        joint_delay_s=0.0,
+        noise={},
+        null={},
+        sets=2,
+        habits=True,
+        masses=MASSES,
+    )
 
 
 def test_a_mass_is_held_against_the_healthy_one_or_the_announced_one(base: BaseSet) -> None:
