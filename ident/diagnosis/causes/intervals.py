@@ -43,12 +43,10 @@ def estimated(dictionary: Dictionary, evidence: Evidence, trial: Trial) -> Estim
     effect, shape = trial.candidate.effect, trial.shape
     moved, rows = _with_derivatives(dictionary, trial)
     linear = [p.name for p in effect.linear][: len(trial.score.coefficients)]
-    kept = list(evidence.extra)
-    evidence.replace([*kept, rows])
-    place = evidence.full.values.size - len(linear) - len(moved)
-    found = evidence.full.values[place:].copy()
-    covariance = _clustered(evidence)[place:, place:]
-    evidence.replace(kept)
+    with evidence.beside([*evidence.extra, rows]):
+        place = evidence.full.values.size - len(linear) - len(moved)
+        found = evidence.full.values[place:].copy()
+        covariance = _clustered(evidence)[place:, place:]
     deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     values = dict(zip(linear, (float(v) for v in trial.score.coefficients), strict=True))
     steps = {name: float(found[len(linear) + k]) for k, name in enumerate(moved)}

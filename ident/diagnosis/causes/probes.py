@@ -199,7 +199,6 @@ def find_remainders(
 
     null : limits of their gain on the healthy arm, by name of the nameless term.
     """
-    fixed = list(evidence.extra)
     found = []
     variables, residuals = hats_of(dictionary), evidence.residuals()
     for side in evidence.nominal.rows:
@@ -212,8 +211,8 @@ def find_remainders(
                 padded = evidence.padded(rows)
                 prepared[name] = rows, padded, evidence.alone(padded)
             least = max(settings.least_gain, (null or {}).get((NAMELESS[side].cause, joint), 0.0))
-            remainder = _one(evidence, least, prepared, line, side, joint, variables)
-            evidence.replace(fixed)
+            with evidence.beside(evidence.extra):
+                remainder = _one(evidence, least, prepared, line, side, joint, variables)
             if remainder is not None:
                 found.append(remainder)
     return tuple(sorted(found, key=lambda r: -r.gain))

@@ -9,6 +9,7 @@ motion never checks itself.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import pairwise
@@ -275,6 +276,16 @@ class Evidence:
                 # The rows are kept too, so that their identity stays theirs.
                 self._known[id(rows)] = (rows, padded, self.alone(padded))
         self._gram()
+
+    @contextmanager
+    def beside(self, extra: Sequence[Rows]) -> Iterator[None]:
+        """Other columns beyond the base for a while, in place of the present ones."""
+        present = self.extra
+        self.replace(extra)
+        try:
+            yield
+        finally:
+            self.replace(present)
 
     def _cross(self, a: Mapping[Key, Floats], b: Mapping[Key, Floats]) -> Floats:
         """Products (blocks, k, l) of two groups of padded columns."""

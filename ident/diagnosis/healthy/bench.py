@@ -243,12 +243,10 @@ def _common_compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalAr
     dictionary = Dictionary(nominal, evidence, [e.cause for e in (ELASTICITY, *DELAYS.values())])
     bent = [c for c in dictionary.candidates if c.joint >= 0 and here[c.joint] > 0.0]
     late = [c for c in dictionary.candidates if c.joint < 0]
-    kept = list(evidence.extra)
     delays = [dictionary.rows(c, Shape(delay=1e-3)) for c in late]
-    evidence.replace([*delays, *(dictionary.rows(c, ELASTICITY.at_encoder("motor")) for c in bent)])
-    place = evidence.base_count + len(late)
-    change, covariance = evidence.full.values[place:], evidence.covariance()[place:, place:]
-    evidence.replace(kept)
+    with evidence.beside([*delays, *(dictionary.rows(c, ELASTICITY.at_encoder("motor")) for c in bent)]):
+        place = evidence.base_count + len(late)
+        change, covariance = evidence.full.values[place:], evidence.covariance()[place:, place:]
     joints = [c.joint for c in bent]
     stated = arm.anchor[joints]
     precision = np.diag((UNSURE * arm.within / STATED_WITHIN * stated) ** -2.0)

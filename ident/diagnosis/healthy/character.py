@@ -82,14 +82,13 @@ class _Set:
         """Whether each of some effects, fitted together, is part of its drive's friction where it is largest; True for
         those that are no law of the speed."""
         nominal, evidence = self.bench.nominal, self.bench.evidence
-        present = list(evidence.extra)
-        evidence.replace([*(trial.rows for trial in trials), *self.state.nuisance_rows])
-        base, torques = evidence.full.values[: evidence.base_count], dict[int, Floats]()
-        for k, (trial, size) in enumerate(zip(trials, evidence.coefficients(), strict=False)):
+        with evidence.beside([*(trial.rows for trial in trials), *self.state.nuisance_rows]):
+            base, sizes = evidence.full.values[: evidence.base_count], evidence.coefficients()
+        torques: dict[int, Floats] = {}
+        for k, (trial, size) in enumerate(zip(trials, sizes, strict=False)):
             law, key = trial.candidate.effect.law, ("motor", trial.candidate.joint)
             if law is not None and law.variable == "qd" and key in trial.rows:
                 torques[k] = trial.rows[key] @ size
-        evidence.replace(present)
         found = [True] * len(trials)
         for k, torque in torques.items():
             joint = trials[k].candidate.joint

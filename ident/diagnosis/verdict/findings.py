@@ -75,14 +75,12 @@ def _parameters(trial: Trial, bench: DiagnosisBench) -> dict[str, Value]:
     values, deviations = estimated(bench.dictionary, evidence, trial)
     columns = companions(bench.dictionary, trial) if effect.beside_companions else None
     if columns is not None:
-        kept = list(evidence.extra)
-        evidence.replace([*kept, columns])
-        beside = bench.dictionary.trial(trial.candidate, trial.shape)
-        if beside is not None:
-            alone = values
-            values, own = estimated(bench.dictionary, evidence, bench.dictionary.refine(beside))
-            deviations = {name: float(np.hypot(own[name], values[name] - alone[name])) for name in own}
-        evidence.replace(kept)
+        with evidence.beside([*evidence.extra, columns]):
+            beside = bench.dictionary.trial(trial.candidate, trial.shape)
+            if beside is not None:
+                alone = values
+                values, own = estimated(bench.dictionary, evidence, bench.dictionary.refine(beside))
+                deviations = {name: float(np.hypot(own[name], values[name] - alone[name])) for name in own}
     change = usual_change(effect, bench.nominal.arm) if evidence.compared else 0.0
     if change:
         # The scale of a healthy arm differs from that of its reference.

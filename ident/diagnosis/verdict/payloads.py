@@ -68,11 +68,9 @@ def other_masses(bench: DiagnosisBench, reference: Reference | None) -> list[Oth
     announced = announced_masses(base, bench.nominal.masses)
     if not announced:
         return []
-    kept = list(evidence.extra)
-    evidence.replace([])
-    values, covariance = evidence.free()
-    inverse = evidence.free_inverse()
-    evidence.replace(kept)
+    with evidence.beside([]):
+        values, covariance = evidence.free()
+        inverse = evidence.free_inverse()
     healthy = {} if reference is None else _healthy(bench, reference)
     freedom = bench.nominal.arm.chain.n * max(1 if reference is None else reference.sets, 1)
     least = fisher_limit(_ONE_IN, 1, freedom)
@@ -114,11 +112,9 @@ def unstated_body(bench: DiagnosisBench, reference: Reference) -> UnstatedBody |
     prior = reference.prior(base, bench.nominal.masses, wider=1.0)
     if prior is None or not evidence.compared:
         return None
-    kept = list(evidence.extra)
-    evidence.replace([])
-    values, covariance = evidence.free()
-    inverse = evidence.free_inverse()
-    evidence.replace(kept)
+    with evidence.beside([]):
+        values, covariance = evidence.free()
+        inverse = evidence.free_inverse()
     precision, healthy = prior
     tied = np.flatnonzero(np.diag(precision) > 0.0)
     spread = covariance[np.ix_(tied, tied)] + np.linalg.inv(precision[np.ix_(tied, tied)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -203,7 +204,7 @@ def test_rounds_of_a_fit_stay_near_the_stated_stiffness(
     evidence = SimpleNamespace(
         extra=[],
         base_count=0,
-        replace=lambda extra: None,
+        beside=lambda extra: nullcontext(),
         full=SimpleNamespace(values=values),
         covariance=lambda: covariance,
     )

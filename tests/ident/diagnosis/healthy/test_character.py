@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -82,7 +83,7 @@ def of_friction(base: tuple[float, float], laws: list[tuple[str, Shape, float]])
         extra=[],
         base_count=2,
         full=SimpleNamespace(values=np.array(base)),
-        replace=lambda extra: None,
+        beside=lambda extra: nullcontext(),
         coefficients=lambda: sizes,
     )
     bench = SimpleNamespace(nominal=nominal, evidence=evidence, dictionary=None)

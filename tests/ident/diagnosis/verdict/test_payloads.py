@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -39,7 +40,7 @@ def bench(base: BaseSet, mass: float, std: float) -> Any:
     values[place], covariance[place, place] = mass, std**2
     evidence = SimpleNamespace(extra=["kept"], free=lambda: (values, covariance))
     evidence.free_inverse = lambda: 1e-4 * np.eye(len(base))
-    evidence.replace = lambda extra: setattr(evidence, "extra", list(extra))
+    evidence.beside = lambda extra: nullcontext(setattr(evidence, "held", list(extra)))
     nominal = SimpleNamespace(base=base, masses=MASSES, arm=SimpleNamespace(chain=base.structure.chain))
     return SimpleNamespace(evidence=evidence, nominal=nominal)
 
@@ -67,7 +68,7 @@ def test_a_mass_is_held_against_the_healthy_one_or_the_announced_one(base: BaseS
     (one,) = other_masses(said, None)
     assert (one.payload, one.mass, one.expected) == ("weight", 2.6, 2.0)
     assert "2.600 ± 0.041 kg by these sessions alone, 2.000 kg expected" in one.text
-    assert said.evidence.extra == ["kept"]
+    assert said.evidence.held == []
     # Findings are in the order of what they take off the error of the rows.
     assert payload_finding(one).gain == pytest.approx(0.6**2 / 1e-4)
     # The healthy arm weighed 2.6 kg under this label, too.
