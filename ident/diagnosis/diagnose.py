@@ -113,7 +113,7 @@ def diagnose(
 def _ended(task: Task, broken: Sequence[BrokenChannel]) -> Diagnosis:
     """The base model alone, without a cause: from worthless data nothing is concluded."""
     task = replace(task, simulate=None)
-    state = State(task.bench(task.arm, task.reference, fit_compliance=False), Selection([], {}, {}))
+    state = State(task.bench(task.arm, task.reference, fit_compliance=False), Selection([]))
     return replace(conclude(task, state), findings=(), unexplained=(), data=tuple(broken))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from ident.diagnosis.causes.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.causes.healthy_null import HealthyNull
 from ident.diagnosis.causes.model_form import model_form_error
-from ident.diagnosis.causes.tolerances import COMPLIANCE, HABIT, LENGTH, SIZE, Tolerance, tolerances
+from ident.diagnosis.causes.tolerances import Deviation, Kind, Tolerance, tolerances
 from ident.diagnosis.causes.usual_sizes import Healthy
 from ident.diagnosis.gain.evidence import Evidence
 from ident.diagnosis.gain.products import Floats, Key, Rows, width_of
@@ -81,17 +81,22 @@ class Claim:
 
 @dataclass(eq=False)
 class Selection:
-    """Result of `select`. `nuisance` : tolerated deviations by name, value and standard deviation."""
+    """Result of `select`. deviations : the tolerated ones within their tolerance. scores : gain of each candidate
+    beside them alone."""
 
     claims: list[Claim]
-    nuisance: dict[str, tuple[float, float]]
-    scores: dict[tuple[str, int], float]
-    nuisance_rows: list[Rows] = field(default_factory=list)
+    deviations: Sequence[Deviation] = ()
+    scores: dict[tuple[str, int], float] = field(default_factory=dict)
 
     @property
-    def tolerated(self) -> dict[str, Rows]:
-        """Rows of the tolerated deviations by name."""
-        return dict(zip(self.nuisance, self.nuisance_rows, strict=True))
+    def nuisance(self) -> dict[str, tuple[float, float]]:
+        """Value and standard deviation of the tolerated deviations by name."""
+        return {one.tolerance.name: (one.value, one.std) for one in self.deviations}
+
+    @property
+    def nuisance_rows(self) -> list[Rows]:
+        """Rows of the tolerated deviations."""
+        return [one.tolerance.rows for one in self.deviations]
 
 
 def select(
@@ -126,7 +131,7 @@ def select(
         claims = [state.claim(accepted, k) for k in range(len(accepted))]
     state.tolerate(accepted)
     claims.sort(key=lambda c: -c.gain)
-    return Selection(claims, state.nuisance, first, state.nuisance_rows)
+    return Selection(claims, state.deviations, first)
 
 
 def gains(
@@ -149,7 +154,7 @@ def best_candidate(
     best = next(iter(state.contenders([])), None)
     if best is None or best.score.gain < _LEAST_GAIN:
         return None
-    return Selection([Claim(best, best.score)], state.nuisance, {}, state.nuisance_rows)
+    return Selection([Claim(best, best.score)], state.deviations)
 
 
 def longer_turns(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings) -> Floats:
@@ -158,9 +163,9 @@ def longer_turns(dictionary: Dictionary, evidence: Evidence, settings: Diagnosis
     state = State(dictionary, evidence, settings)
     state.tolerate([])
     found = np.zeros(dictionary.nominal.arm.chain.n)
-    for joint in range(len(found)):
-        change, std = state.nuisance.get(f"{LENGTH} {joint + 1}", (0.0, 0.0))
-        found[joint] = change if abs(change) > _CERTAIN * std else 0.0
+    for one in state.deviations:
+        if one.tolerance.kind is Kind.LENGTH and abs(one.value) > _CERTAIN * one.std:
+            found[one.tolerance.number] = one.value
     return found
 
 
@@ -200,8 +205,7 @@ class State:
     evidence: Evidence
     settings: DiagnosisSettings
     healthy: Healthy = field(default_factory=Healthy)
-    nuisance: dict[str, tuple[float, float]] = field(default_factory=dict)
-    nuisance_rows: list[Rows] = field(default_factory=list)
+    deviations: Sequence[Deviation] = ()
     null: HealthyNull = field(init=False)
     _tolerances: list[Tolerance] | None = None
     _accepted: Sequence[Trial] = ()
@@ -237,11 +241,10 @@ class State:
             inside = [one for one, share in zip(inside, over, strict=True) if share < max(over)]
         # A motion without information on a deviation leaves its variance open.
         std = np.sqrt(np.maximum(np.diag(self.evidence.full.inverse), 0.0))[place:]
-        self.nuisance = {
-            one.name: (float(v) * one.unit, float(s) * one.unit)
+        self.deviations = [
+            Deviation(one, float(v) * one.unit, float(s) * one.unit)
             for one, v, s in zip(inside, values, std, strict=True)
-        }
-        self.nuisance_rows = [one.rows for one in inside]
+        ]
 
     # ---- rounds ----
 
@@ -300,7 +303,7 @@ class State:
     def habit(self, found: Sequence[Trial]) -> bool:
         """Tolerates the best candidate of a gain as on healthy days, near that of the best one of all; whether there is
         one. A change from day to day that is not in the model would pass for other causes."""
-        known = [one for one in self.tolerated() if one.name.startswith(HABIT)]
+        known = [one for one in self.tolerated() if one.kind is Kind.HABIT]
         near = [t for t in found if t.score.gain > max(_LEAST_HABIT, _NEAR * found[0].score.gain)]
         shapes = Counter(one.of for one in known)
         for trial in near:
@@ -310,8 +313,7 @@ class State:
             single = len(trial.score.coefficients) == 1 and not trial.candidate.effect.timed(trial.shape)
             if single and not self.carried(trial) and self.carried(trial, healthy=False):
                 log.info("%s: gain %.0f, as on healthy days", trial.candidate.key, trial.score.gain)
-                name = f"{HABIT} {len(known) + 1}: {trial.candidate.cause} {trial.candidate.joint + 1}"
-                self.tolerated().append(Tolerance(name, trial.rows, 1.0, np.inf, trial.candidate.key))
+                self.tolerated().append(Tolerance(Kind.HABIT, len(known), trial.rows, np.inf, key))
                 return True
         return False
 
@@ -320,7 +322,7 @@ class State:
         known = [
             one.size
             for one in self.tolerated()
-            if one.of == trial.candidate.key and one.name.startswith(COMPLIANCE)
+            if one.of == trial.candidate.key and one.kind is Kind.COMPLIANCE
         ]
         return bool(known) and float(np.abs(trial.score.coefficients[0])) <= known[0]
 
@@ -328,17 +330,15 @@ class State:
         """Whether a trial is more than on a healthy arm only beside habits in its rows: the healthy sets were without
         them, and columns of friction share it among them."""
         known = self.tolerated()
-        others = [
-            one for one in known if not (one.name.startswith(HABIT) and set(one.rows) & set(trial.rows))
-        ]
+        others = [one for one in known if not (one.kind is Kind.HABIT and set(one.rows) & set(trial.rows))]
         if len(others) == len(known):
             return False
-        present, nuisance, rows = list(self.evidence.extra), self.nuisance, self.nuisance_rows
+        present, deviations = list(self.evidence.extra), self.deviations
         self._tolerances = others
         self.tolerate(self._accepted)
         alone = self.dictionary.trial(trial.candidate, trial.shape, self.choices(trial))
         found = alone is None or not self.null.exceeded(alone)
-        self._tolerances, self.nuisance, self.nuisance_rows = known, nuisance, rows
+        self._tolerances, self.deviations = known, deviations
         self.evidence.replace(present)
         return found
 
@@ -352,7 +352,7 @@ class State:
         own = [
             one
             for one in self.tolerated()
-            if one.name.startswith(SIZE)
+            if one.kind is Kind.SIZE
             and one.of is not None
             and one.of[1] == candidate.joint
             and EFFECTS[one.of[0]].law == law

@@ -7,7 +7,9 @@ torque sensors, the presliding lengths of the drives, and the sizes of the healt
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -43,30 +45,77 @@ _WHOLE = 1.3
 # Standard deviation of a further day from the mean of two, over that of a day.
 _FURTHER = 1.5**0.5
 
+_LATE = tuple(effect.cause for effect in DELAYS.values())
+
 HABITUAL = 3.0
 """Largest change from day to day, in standard deviations."""
-GAIN = "gain"
-"""Name of the tolerated deviation of a torque sensor's gain, before the number of its joint."""
-COMPLIANCE = "compliance"
-"""The same for a joint's compliance."""
-LENGTH = "presliding"
-"""The same for the presliding length of a drive, the logarithm of the factor on it."""
-TURNING = "turning"
-"""The same for friction that turns over the usual length where that of the drive is unknown, a share of it."""
-HABIT = "habit"
-"""The same for a habit of the arm, before its number, its cause and its joint."""
-SIZE = "size"
-"""The same for one of the healthy arm's own effects, a share of it, before its number among them."""
 
 
-class Tolerance(NamedTuple):
-    """A tolerated deviation: name, rows, unit of the coefficient, largest size, and the candidate with these rows."""
+class Kind(Enum):
+    """What a tolerated deviation is of."""
 
-    name: str
+    DELAY = "delay"
+    COMPLIANCE = "compliance"
+    GAIN = "gain"
+    """Of a torque sensor."""
+    LENGTH = "presliding"
+    """The logarithm of the factor on the presliding length of a drive."""
+    TURNING = "turning"
+    """The share of a drive's friction that turns over the usual length, where its own is unknown."""
+    SIZE = "size"
+    """Of one of the healthy arm's own effects, as a share of it."""
+    HABIT = "habit"
+    """A candidate of a gain as on healthy days."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tolerance:
+    """A tolerated deviation. number : of its joint, of the healthy effect or of the habit, from 0; -1 for a whole
+    channel. unit : of the coefficient. size : the largest. of : the candidate with these rows.
+    """
+
+    kind: Kind
+    number: int
     rows: Rows
-    unit: float
     size: float
     of: tuple[str, int] | None = None
+    unit: float = 1.0
+
+    @property
+    def name(self) -> str:
+        """In short, once in an arm."""
+        if self.kind is Kind.HABIT and self.of is not None:
+            cause, joint = self.of
+            return f"{self.kind.value} {self.number + 1}: {cause} {joint + 1}"
+        if self.kind is not Kind.DELAY:
+            return f"{self.kind.value} {self.number + 1}"
+        return f"{self.channel} delay" if self.channel else f"delay of joint {self.number + 1} apart"
+
+    @property
+    def cause(self) -> str | None:
+        """Of the candidate with these rows."""
+        return None if self.of is None else self.of[0]
+
+    @property
+    def channel(self) -> str | None:
+        """The channel that is late as a whole; None for other deviations."""
+        if self.kind is not Kind.DELAY or self.cause is None:
+            return None
+        return find_effect(self.cause).channel
+
+    @property
+    def delays(self) -> bool:
+        """Whether it delays torques: no torque of its own."""
+        return self.kind is Kind.DELAY or self.cause in _LATE
+
+
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """A tolerated deviation in a fit: value and standard deviation."""
+
+    tolerance: Tolerance
+    value: float
+    std: float
 
 
 def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings) -> list[Tolerance]:
@@ -76,7 +125,7 @@ def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSe
     for side in nominal.rows:
         rows = dictionary.rows(Candidate(DELAYS[side], -1), Shape(delay=1e-3))
         if side == "motor":
-            found.append(Tolerance("motor delay", rows, 1e-3, limit, (DELAYS[side].cause, -1)))
+            found.append(Tolerance(Kind.DELAY, -1, rows, limit, (DELAYS[side].cause, -1), 1e-3))
         else:
             found += _joint_delays(dictionary, evidence, rows, limit)
     if "motor" in nominal.rows and np.any(nominal.arm.compliance > 0.0):
@@ -90,14 +139,12 @@ def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSe
             rows = dictionary.rows(Candidate(ELASTICITY, joint), shape)
             if rows:
                 size = max(share * float(nominal.arm.compliance[joint]), float(unknown[joint]))
-                found.append(
-                    Tolerance(f"{COMPLIANCE} {joint + 1}", rows, 1.0, size, (ELASTICITY.cause, joint))
-                )
+                found.append(Tolerance(Kind.COMPLIANCE, joint, rows, size, (ELASTICITY.cause, joint)))
     if evidence.compared:
         # Without a reference the gains of the sensors are hardly distinguishable from a scale of all masses.
         size = HABITUAL * _FURTHER * nominal.arm.gain_std
         found += [
-            Tolerance(f"{GAIN} {j + 1}", rows, 1.0, size, (SENSOR_GAIN.cause, j))
+            Tolerance(Kind.GAIN, j, rows, size, (SENSOR_GAIN.cause, j))
             for j, rows in gain_rows(dictionary).items()
         ]
         found += _lengths(dictionary)
@@ -119,11 +166,11 @@ def _joint_delays(dictionary: Dictionary, evidence: Evidence, rows: Rows, limit:
     }
     best = max(keys, key=lambda key: weight[key])
     common = (_KNOWN_DELAY if known else 2.0) * limit
-    found = [Tolerance("joint delay", rows, 1e-3, common, (DELAYS["joint"].cause, -1))]
+    found = [Tolerance(Kind.DELAY, -1, rows, common, (DELAYS["joint"].cause, -1), 1e-3)]
     for key in keys:
         if key != best and weight[best] > 0.0:
             apart = {key: rows[key], best: -weight[key] / weight[best] * rows[best]}
-            found.append(Tolerance(f"delay of joint {key[1] + 1} apart", apart, 1e-3, 2.0 * limit))
+            found.append(Tolerance(Kind.DELAY, key[1], apart, 2.0 * limit, unit=1e-3))
     return found
 
 
@@ -141,7 +188,7 @@ def _sizes(dictionary: Dictionary, evidence: Evidence, least_gain: float) -> lis
             continue
         size = HABITUAL * _FURTHER * _usual_share(entry, effect)
         if evidence.information(evidence.alone(evidence.padded(rows))) * size**2 > least_gain:
-            found.append(Tolerance(f"{SIZE} {number + 1}", rows, 1.0, size, candidate.key))
+            found.append(Tolerance(Kind.SIZE, number, rows, size, candidate.key))
     return found
 
 
@@ -186,6 +233,6 @@ def _lengths(dictionary: Dictionary) -> list[Tolerance]:
             return [Column(motor=float(motion.motor_coulomb[joint]) * np.asarray(total))]
 
         rows = {("motor", joint): nominal.columns(made, ["motor"])["motor"][0][:, None]}
-        name, size = (LENGTH, np.log(_LONGEST)) if own > 0.0 else (TURNING, _WHOLE)
-        found.append(Tolerance(f"{name} {joint + 1}", rows, 1.0, size, (PRESLIDING.cause, joint)))
+        kind, size = (Kind.LENGTH, np.log(_LONGEST)) if own > 0.0 else (Kind.TURNING, _WHOLE)
+        found.append(Tolerance(kind, joint, rows, size, (PRESLIDING.cause, joint)))
     return found

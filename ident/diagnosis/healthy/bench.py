@@ -9,7 +9,7 @@ import numpy as np
 
 from ident.diagnosis.causes.candidates import Dictionary, Trial
 from ident.diagnosis.causes.selection import Selection
-from ident.diagnosis.causes.tolerances import gain_rows
+from ident.diagnosis.causes.tolerances import Deviation, gain_rows
 from ident.diagnosis.gain.evidence import Evidence
 from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.healthy.reference import Reference, joint_of, symbol_of
@@ -298,11 +298,11 @@ def slow_delay(bench: DiagnosisBench, trial: Trial) -> tuple[float, float]:
     return delay * float(score.coefficients[0]), abs(delay) * float(np.sqrt(score.covariance[0, 0]))
 
 
-def mean_delay(nuisance: Mapping[str, tuple[float, float]], side: str) -> tuple[float, float]:
+def mean_delay(deviations: Sequence[Deviation], side: str) -> tuple[float, float]:
     """Weighted mean of the tolerated delays of a side, and its standard deviation [s]."""
-    entries = [value for name, value in nuisance.items() if name.startswith(f"{side} delay")]
+    entries = [one for one in deviations if one.tolerance.channel == side]
     if not entries:
         return 0.0, 2e-4
-    weights = [1.0 / max(std, 1e-6) ** 2 for _, std in entries]
-    mean = sum(w * value for w, (value, _) in zip(weights, entries, strict=True)) / sum(weights)
+    weights = [1.0 / max(one.std, 1e-6) ** 2 for one in entries]
+    mean = sum(w * one.value for w, one in zip(weights, entries, strict=True)) / sum(weights)
     return float(mean), float(1.0 / np.sqrt(sum(weights)))

@@ -69,9 +69,7 @@ class _Set:
         """The same with the noise that the accepted effects leave."""
         self.state.tolerate(self.accepted)
         claims = [Claim(trial, trial.score) for trial in self.accepted]
-        bench = again_with(
-            self.bench, Selection(claims, {}, {}, self.state.nuisance_rows), self.settings, causes
-        )
+        bench = again_with(self.bench, Selection(claims, self.state.deviations), self.settings, causes)
         if bench is None:
             return self
         again = _Set(bench, self.settings)
@@ -82,7 +80,9 @@ class _Set:
         """Whether each of some effects, fitted together, is part of its drive's friction where it is largest; True for
         those that are no law of the speed."""
         nominal, evidence = self.bench.nominal, self.bench.evidence
-        with evidence.beside([*(trial.rows for trial in trials), *self.state.nuisance_rows]):
+        with evidence.beside(
+            [*(trial.rows for trial in trials), *(one.tolerance.rows for one in self.state.deviations)]
+        ):
             base, sizes = evidence.full.values[: evidence.base_count], evidence.coefficients()
         torques: dict[int, Floats] = {}
         for k, (trial, size) in enumerate(zip(trials, sizes, strict=False)):
@@ -279,7 +279,9 @@ def _fitted(one: _Set, trials: Sequence[Trial]) -> list[tuple[Floats, Floats, bo
     """Coefficients (k,) of effects fitted together, their covariance (k, k), and whether they are part of the
     friction, see `_Set.parts`."""
     evidence = one.bench.evidence
-    evidence.replace([*(trial.rows for trial in trials), *one.state.nuisance_rows])
+    evidence.replace(
+        [*(trial.rows for trial in trials), *(deviation.tolerance.rows for deviation in one.state.deviations)]
+    )
     covariance, place, found = evidence.covariance(), evidence.base_count, []
     for value, part in zip(evidence.coefficients(), one.parts(trials), strict=False):
         here = slice(place, place + len(value))

@@ -260,7 +260,7 @@ def _tuned(
             if bench.nominal.rows.keys() <= late.keys()
             else replace(settings, delay_tolerance_s=_LATEST_S)
         )
-        nuisance = select(bench.dictionary, evidence, wide, None).nuisance
+        deviations = select(bench.dictionary, evidence, wide, None).deviations
         count = max(sum(float(m.sum()) for m in evidence.mask.values()), 1.0)
         rms = [float(np.log(v).mean()) for v in evidence.sigma.values()]
         misfit = float(np.log(evidence.chi_square / count) + 2.0 * np.mean(rms))
@@ -268,7 +268,7 @@ def _tuned(
             bench.nominal.arm,
             presliding=presliding_length(bench.nominal, evidence.full.values[: len(base)]),
         )
-        arm = _later(arm, {side: mean_delay(nuisance, side)[0] for side in CHANNELS if side not in late})
+        arm = _later(arm, {side: mean_delay(deviations, side)[0] for side in CHANNELS if side not in late})
     return _Tuned(misfit, arm, bench.compliance_std, base)
 
 
@@ -352,7 +352,7 @@ def _day(
     evidence = bench.evidence
     # `select` adds the tolerated deviations to the base.
     selection = select(bench.dictionary, evidence, settings, None)
-    nuisance, p = selection.nuisance, evidence.base_count
+    p = evidence.base_count
     values = evidence.full.values[:p].copy()
     residual = evidence.residuals()
     noise = {side: misfit(rows, residual[side]) for side, rows in bench.nominal.rows.items()}
@@ -368,7 +368,7 @@ def _day(
         },
         coulomb=bench.nominal.motions[0].motor_coulomb,
         slow_turns=slow_turns(bench.nominal, bench.evidence),
-        late={side: mean_delay(nuisance, side) for side in CHANNELS},
+        late={side: mean_delay(selection.deviations, side) for side in CHANNELS},
         gains=_gains(bench, selection.nuisance_rows),
         whole=bench.nominal.whole_friction(values),
     )

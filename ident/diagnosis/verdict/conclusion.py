@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.diagnosis.causes.probes import Remainder, find_remainders
-from ident.diagnosis.causes.tolerances import GAIN, HABIT, SIZE
+from ident.diagnosis.causes.tolerances import Kind
 from ident.diagnosis.gain.held_out import BEYOND_HEALTHY, HeldOut, held_out, worse_rows
 from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.healthy.bench import DiagnosisBench
@@ -59,8 +59,10 @@ def conclude(task: Task, state: State) -> Diagnosis:
         shown = held_out(evidence, [*(one.claim.trial.rows for one in kept), *nuisance])
         # Without the reference's prior, gains of the sensors and drive inertias compensate each other, and so do
         # Coulomb and viscous friction and further laws, of fixed size or none in the reference's parameters.
-        free = (GAIN, SIZE, HABIT)
-        tolerated = [rows for name, rows in state.selection.tolerated.items() if not name.startswith(free)]
+        free = (Kind.GAIN, Kind.SIZE, Kind.HABIT)
+        tolerated = [
+            one.tolerance.rows for one in state.selection.deviations if one.tolerance.kind not in free
+        ]
         claimed = [one.claim.trial.rows for one in kept]
         worn = wear(bench, task.reference, shown, claimed, tolerated, remainders)
     members = [

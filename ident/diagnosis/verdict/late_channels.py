@@ -53,11 +53,9 @@ def in_time(task: Task, state: State) -> State:
         late = _late(state.selection)
     if not late:
         return replace(state, left_out=tuple(doubtful))
-    tolerated, beside = (
-        {name: rows for name, rows in found.items() if "delay" not in name}
-        for found in (state.selection.tolerated, lasting(state.selection))
-    )
-    baseline = Baseline.of(state.bench, list(tolerated.values()), beside)
+    tolerated = [one.tolerance.rows for one in state.selection.deviations if not one.tolerance.delays]
+    beside = [one for one in lasting(state.selection) if not one.delays]
+    baseline = Baseline.of(state.bench, tolerated, beside)
     shifted, bench, amounts = task.arm, state.bench, {c.trial.candidate.cause: _made(c) for c in late}
     healthy = _at_another_phase(task.reference) if DELAYS["motor"].cause in amounts else task.reference
     for _ in range(_SHIFTS):
@@ -139,14 +137,9 @@ def _rest(bench: DiagnosisBench, selection: Selection, cause: str) -> tuple[floa
     """Remaining delay of a channel and its standard deviation [s], beside all claims but presliding, similar to a
     late motor.
     """
-    side = EFFECTS[cause].channel
     alike = (cause, PRESLIDING.cause)
     taken = [c.trial.rows for c in selection.claims if c.trial.candidate.cause not in alike]
-    tolerated = [
-        rows
-        for name, rows in selection.tolerated.items()
-        if not (name.startswith(f"{side} delay") or cause in name)
-    ]
+    tolerated = [one.tolerance.rows for one in selection.deviations if one.tolerance.cause != cause]
     bench.evidence.replace([*taken, *tolerated])
     columns = bench.dictionary.rows(Candidate(EFFECTS[cause], -1), Shape(delay=_UNIT_S))
     return _delay_of(bench.evidence.score(bench.evidence.padded(columns)))

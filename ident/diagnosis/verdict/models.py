@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ident.diagnosis.causes.selection import Selection
-from ident.diagnosis.causes.tolerances import COMPLIANCE, GAIN, LENGTH, SIZE, TURNING
+from ident.diagnosis.causes.tolerances import Kind, Tolerance
 from ident.diagnosis.gain.held_out import HeldOut
-from ident.diagnosis.gain.products import Floats, Rows
+from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.healthy.bench import DiagnosisBench
 from ident.diagnosis.outcome.result import Finding, Nameless
 from ident.diagnosis.outcome.torque_errors import TorqueErrors, errors_of_both
@@ -34,16 +34,16 @@ Entries = tuple[Mapping[str, Any], ...]
 _CLEAR, _MATTERS = 2.0, 0.5
 
 
-def lasting(selection: Selection) -> dict[str, Rows]:
+def lasting(selection: Selection) -> list[Tolerance]:
     """The tolerated deviations that stay beside the columns of a model: delays and stiffness, which are no torques,
     and the gains of the torque sensors and the sizes of the healthy effects that are clear of zero, which the
     models predict as on these days."""
-    found = {}
-    for name, rows in selection.tolerated.items():
-        value, std = selection.nuisance[name]
-        clear = abs(value) > max(_CLEAR * std, _MATTERS * GAIN_STD)
-        if "delay" in name or name.startswith(COMPLIANCE) or (name.startswith((GAIN, SIZE)) and clear):
-            found[name] = rows
+    found = []
+    for one in selection.deviations:
+        clear = abs(one.value) > max(_CLEAR * one.std, _MATTERS * GAIN_STD)
+        no_torque = one.tolerance.delays or one.tolerance.kind is Kind.COMPLIANCE
+        if no_torque or (one.tolerance.kind in (Kind.GAIN, Kind.SIZE) and clear):
+            found.append(one.tolerance)
     return found
 
 
@@ -101,14 +101,14 @@ def _with_effects(
 ) -> DynamicModel:
     """The model with the healthy arm's effects, the gains of its sensors, the turning of its friction, and `found`."""
     gains = [
-        entry_of(SENSOR_GAIN, [int(name.rpartition(" ")[2])], {"error": one})
-        for name, one in fit.beside.items()
-        if name.startswith(GAIN)
+        entry_of(SENSOR_GAIN, [one.tolerance.number + 1], {"error": (one.value, one.std)})
+        for one in fit.beside
+        if one.tolerance.kind is Kind.GAIN
     ]
     turning = turning_friction(model, bench, selection, found)
+    sizes = {one.tolerance.number: one.value for one in fit.beside if one.tolerance.kind is Kind.SIZE}
     own = [
-        sized(entry, 1.0 + fit.beside.get(f"{SIZE} {number + 1}", (0.0, 0.0))[0])
-        for number, entry in enumerate(bench.nominal.arm.healthy)
+        sized(entry, 1.0 + sizes.get(number, 0.0)) for number, entry in enumerate(bench.nominal.arm.healthy)
     ]
     return replace(model, effects=(*own, *gains, *turning, *found))
 
@@ -127,15 +127,20 @@ def turning_friction(
             level[entry["joints"][0] - 1] -= parameter_values(entry)["amplitude"]
     level = np.maximum(level, 0.0)
 
-    def told(kind: str) -> Floats:
-        """Value over `_CLEAR` standard deviations of a tolerated deviation (n,), else 0."""
-        pairs = [selection.nuisance.get(f"{kind} {joint + 1}", (0.0, 0.0)) for joint in range(len(level))]
-        return np.array([value if abs(value) > _CLEAR * std else 0.0 for value, std in pairs])
+    def told(kind: Kind) -> Floats:
+        """Values (n,) of a kind of deviation over `_CLEAR` standard deviations, else 0."""
+        values = np.zeros(len(level))
+        for one in selection.deviations:
+            if one.tolerance.kind is kind and abs(one.value) > _CLEAR * one.std:
+                values[one.tolerance.number] = one.value
+        return values
 
-    unknown = replace(nominal.arm, presliding=np.where(told(TURNING) > 0.0, nominal.arm.usual_length, 0.0))
+    unknown = replace(
+        nominal.arm, presliding=np.where(told(Kind.TURNING) > 0.0, nominal.arm.usual_length, 0.0)
+    )
     return [
-        *nominal.arm.turning(level, np.exp(told(LENGTH))),
-        *unknown.turning(level * np.minimum(told(TURNING), 1.0)),
+        *nominal.arm.turning(level, np.exp(told(Kind.LENGTH))),
+        *unknown.turning(level * np.minimum(told(Kind.TURNING), 1.0)),
     ]
 
 

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ident.diagnosis.causes.selection import Selection, select
+from ident.diagnosis.causes.tolerances import Deviation, Tolerance
 from ident.diagnosis.causes.usual_sizes import Healthy
 from ident.diagnosis.gain.evidence import Evidence
 from ident.diagnosis.gain.held_out import HeldOut, held_out
@@ -77,22 +78,21 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class ModelFit:
-    """A fit of a model: base parameters (p,), their covariance, and value and standard deviation of each tolerated
-    deviation beside them."""
+    """A fit of a model: base parameters (p,), their covariance, and the tolerated deviations beside them."""
 
     values: Floats
     covariance: Floats
-    beside: Mapping[str, tuple[float, float]]
+    beside: Sequence[Deviation]
 
     @classmethod
-    def of(cls, evidence: Evidence, columns: Sequence[Rows], beside: Mapping[str, Rows]) -> ModelFit:
+    def of(cls, evidence: Evidence, columns: Sequence[Rows], beside: Sequence[Tolerance]) -> ModelFit:
         """Fitted with columns of the model and tolerated deviations of one column each; all stay in the evidence."""
-        evidence.replace([*columns, *beside.values()])
+        evidence.replace([*columns, *(one.rows for one in beside)])
         p, values, covariance = evidence.base_count, evidence.full.values, evidence.covariance()
         first = len(values) - len(beside)
         deviations = np.sqrt(np.maximum(np.diag(covariance)[first:], 0.0))
-        pairs = zip(values[first:].tolist(), deviations.tolist(), strict=True)
-        return cls(values[:p].copy(), covariance[:p, :p], dict(zip(beside, pairs, strict=True)))
+        found = zip(beside, values[first:].tolist(), deviations.tolist(), strict=True)
+        return cls(values[:p].copy(), covariance[:p, :p], [Deviation(*one) for one in found])
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ class Baseline:
     fit: ModelFit
 
     @classmethod
-    def of(cls, bench: DiagnosisBench, tolerated: Sequence[Rows], lasting: Mapping[str, Rows]) -> Baseline:
+    def of(cls, bench: DiagnosisBench, tolerated: Sequence[Rows], lasting: Sequence[Tolerance]) -> Baseline:
         """Fitted on a bench. tolerated : deviations beside the rows. lasting : those beside the model."""
         held = held_out(bench.evidence, tolerated)
         return cls(held, ModelFit.of(bench.evidence, (), lasting))

@@ -12,7 +12,7 @@ import pytest
 from ident.diagnosis.causes.candidates import Candidate, Trial
 from ident.diagnosis.causes.healthy_null import HealthyNull
 from ident.diagnosis.causes.selection import State
-from ident.diagnosis.causes.tolerances import Tolerance
+from ident.diagnosis.causes.tolerances import Kind, Tolerance
 from ident.diagnosis.causes.usual_sizes import Healthy
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.healthy import bench, channel_delays
@@ -328,7 +328,7 @@ def test_habits_of_healthy_days_are_tolerated_beside_every_cause(chain: Chain) -
 def test_what_is_unusual_beside_a_habit_alone_is_no_claim(monkeypatch: pytest.MonkeyPatch) -> None:
     """Healthy sets were without the habit, and columns of the same friction share it."""
     here = {("motor", 0): np.ones((3, 1))}
-    habit = Tolerance("habit 1: stribeck 1", here, 1.0, np.inf, ("stribeck", 0))
+    habit = Tolerance(Kind.HABIT, 0, here, np.inf, ("stribeck", 0))
     trial = Trial(Candidate(EFFECTS["viscous_nonlinear"], 0), Shape(exponent=0.4), _score(900.0), here)
     clear = replace(trial.score, robust=lambda: (1e-4 * np.eye(1), 40))
     trial = replace(trial, score=clear)

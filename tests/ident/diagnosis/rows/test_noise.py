@@ -66,7 +66,7 @@ def test_what_a_coarse_law_leaves_of_a_fault_is_no_noise(
     rows = {(side, joint): np.sin(np.arange(len(bench.nominal.rows[side].time)))[:, None]}
     score = bench.evidence.score(bench.evidence.padded(rows))
     trial = Trial(Candidate(EFFECTS["sensor_ripple"], joint), Shape(), score, rows)
-    selection = Selection([Claim(trial, score)], {}, {})
+    selection = Selection([Claim(trial, score)])
     sigma, inflation = bench.evidence.sigma[side], bench.evidence.variance_inflation[side]
     sigma[:], inflation[:] = 0.1, 10.0
     for left, lasting, kept in (

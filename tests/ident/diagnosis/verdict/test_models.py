@@ -9,27 +9,40 @@ import numpy as np
 import pytest
 
 from ident.diagnosis.causes.selection import Selection
+from ident.diagnosis.causes.tolerances import Deviation, Kind, Tolerance
 from ident.diagnosis.rows.nominal_arm import NominalArm
 from ident.diagnosis.verdict.models import lasting, turning_friction
-from ident.effects import PRESLIDING, entry_of
+from ident.effects import DELAYS, PRESLIDING, entry_of
 
 
-def selection(**tolerated: tuple[float, float]) -> Selection:
-    names = {name.replace("_", " "): value for name, value in tolerated.items()}
-    return Selection([], names, {}, [{} for _ in names])
+def selection(*tolerated: tuple[Kind, int, float, float]) -> Selection:
+    late = (DELAYS["motor"].cause, -1)
+    return Selection(
+        [],
+        [
+            Deviation(Tolerance(kind, number, {}, 1.0, late if number < 0 else None), value, std)
+            for kind, number, value, std in tolerated
+        ],
+    )
 
 
 def test_a_model_stays_beside_delays_stiffness_and_clear_gains_alone() -> None:
     tolerated = selection(
-        motor_delay=(1e-3, 1e-4),
-        compliance_2=(1e-5, 1e-6),
-        gain_1=(0.02, 0.001),
-        gain_2=(0.02, 0.015),
-        gain_3=(0.001, 1e-5),
-        presliding_4=(0.3, 0.1),
-        habit_1=(0.8, 0.1),
+        (Kind.DELAY, -1, 1e-3, 1e-4),
+        (Kind.COMPLIANCE, 1, 1e-5, 1e-6),
+        (Kind.GAIN, 0, 0.02, 0.001),
+        (Kind.GAIN, 1, 0.02, 0.015),
+        (Kind.GAIN, 2, 0.001, 1e-5),
+        (Kind.LENGTH, 3, 0.3, 0.1),
     )
-    assert list(lasting(tolerated)) == ["motor delay", "compliance 2", "gain 1"]
+    stribeck, late = ("stribeck", 0), (DELAYS["motor"].cause, -1)
+    tolerated.deviations = [
+        *tolerated.deviations,
+        Deviation(Tolerance(Kind.HABIT, 0, {}, np.inf, stribeck), 0.8, 0.1),
+        Deviation(Tolerance(Kind.HABIT, 1, {}, np.inf, late), 0.8, 0.1),
+    ]
+    names = [one.name for one in lasting(tolerated)]
+    assert names == ["motor delay", "compliance 2", "gain 1", f"habit 2: {late[0]} 0"]
 
 
 def bench(rows: tuple[str, ...], far_share: float = 0.0) -> Any:
@@ -55,7 +68,7 @@ def sizes(entries: list[dict[str, Any]]) -> list[tuple[float, float]]:
 
 def test_the_friction_of_a_drive_turns_over_the_length_of_these_days() -> None:
     entries = turning_friction(
-        model(0.5, 4.0), bench(("joint", "motor")), selection(presliding_2=(np.log(1.5), 0.1)), ()
+        model(0.5, 4.0), bench(("joint", "motor")), selection((Kind.LENGTH, 1, np.log(1.5), 0.1)), ()
     )
     assert sizes(entries) == [pytest.approx((4.0, 0.015))]
 

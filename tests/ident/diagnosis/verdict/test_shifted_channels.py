@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ident.diagnosis.causes.candidates import Candidate
+from ident.diagnosis.causes.selection import Selection
+from ident.diagnosis.causes.tolerances import Deviation, Kind, Tolerance
 from ident.diagnosis.outcome.signatures import signature_bench
 from ident.diagnosis.verdict.late_channels import _rest
 from ident.dynamics.kinematics import Chain
@@ -32,7 +33,11 @@ def test_the_remaining_delay_stands_beside_no_other_column_of_the_same(
     def column(length_s: float) -> Any:
         return bench.dictionary.rows(Candidate(delay, -1), Shape(delay=length_s))
 
-    tolerated = {"motor delay": column(1e-3), f"habit 1: {delay.cause} 0": column(-4e-3)}
-    selection: Any = SimpleNamespace(claims=[], tolerated=tolerated)
+    place = (delay.cause, -1)
+    same = (
+        Tolerance(Kind.DELAY, -1, column(1e-3), 1e-3, place),
+        Tolerance(Kind.HABIT, 0, column(-4e-3), np.inf, place),
+    )
+    selection = Selection([], [Deviation(one, 0.0, 1e-3) for one in same])
     rest, std = _rest(bench, selection, delay.cause)
     assert rest == pytest.approx(LATE_S, abs=max(3.0 * std, 2e-4))
