@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         cross_validate,
         identify,
         identify_payload,
+        known_settings,
         validate,
     )
     from ident.excitation import plan
@@ -39,6 +40,7 @@ __all__ = [
     "export",
     "identify",
     "identify_payload",
+    "known_settings",
     "plan",
     "read_model",
     "read_session",
@@ -55,6 +57,7 @@ _HOMES = {
         "cross_validate",
         "identify",
         "identify_payload",
+        "known_settings",
         "validate",
     ),
     "ident.excitation": ("plan",),

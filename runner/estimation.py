@@ -12,14 +12,12 @@ from typing import Annotated, Literal
 
 from fri.errors import ConfigurationError
 from fri.quantities import Name, within
-from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coulomb, Coupling
 from ident.estimation.essential import EssentialSettings
 from ident.estimation.identify import AUTO, IdentificationSettings, estimator_factory
 from ident.estimators import ESTIMATORS, CovarianceSettings
 from ident.model import DynamicModel
 from ident.rows.filters import SignalSettings
-from lwr_driver.arm import Arm
 from lwr_driver.configuration import find, parse, read_mapping
 from lwr_driver.places import Place
 from lwr_driver.session import Session
@@ -171,17 +169,6 @@ def check_spans(
             raise ConfigurationError(f"{place}: `{keys[0]}`: `{keys[1]}`: {said}")
 
 
-def couplings(texts: Sequence[str]) -> tuple[Coupling, ...]:
-    """Coupled pairs of joints, each as `A5:A6`."""
-    found = []
-    for text in texts:
-        first, mark, second = text.partition(":")
-        if not mark or not first or not second or first == second:
-            raise ConfigurationError(f"--coupling {text!r} does not name two joints, such as A5:A6")
-        found.append(Coupling((first, second)))
-    return tuple(found)
-
-
 def recorded_couplings(sessions: Sequence[Session]) -> tuple[str, ...]:
     """Coupled pairs of joints in the metadata of imported sessions, each as `A5:A6`."""
     return tuple(
@@ -226,22 +213,6 @@ def announced(
     return corrected
 
 
-def known_from(
-    sessions: Sequence[Session], chain: Chain, wanted: IdentificationSettings, model: int | None = None
-) -> IdentificationSettings:
-    """The settings with what is known of the arm: the stiffness of its file; Model 1 without motor torques.
-
-    model : as asked for, None for none.
-    """
-    if model is None and all(session.motor is None for session in sessions):
-        wanted = dataclasses.replace(wanted, model=1)
-    arm = known_arm(None, chain)
-    if arm is None or wanted.signals.stiffness_nm_rad is not None:
-        return wanted
-    signals = dataclasses.replace(wanted.signals, stiffness_nm_rad=tuple(arm.stiffness.tolist()))
-    return dataclasses.replace(wanted, signals=signals)
-
-
 def named_model(model: DynamicModel, robot: str, files: Mapping[str, str] | None = None) -> DynamicModel:
     """The identified model with the name of the robot, and this software in its provenance.
 
@@ -249,11 +220,3 @@ def named_model(model: DynamicModel, robot: str, files: Mapping[str, str] | None
     """
     origin = {"software": software()} | ({"files": dict(files)} if files else {})
     return dataclasses.replace(model, robot=robot, provenance={**model.provenance, **origin})
-
-
-def known_arm(name: str | None, chain: Chain) -> Arm | None:
-    """The arm file called `name`; without a name the default one, if its joints are those of the chain."""
-    if name is not None:
-        return Arm.load(name)
-    arm = Arm.load()
-    return arm if arm.joint_names == chain.joint_names else None

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.known_arm import known_arm
 from ident.effects import EncoderSide
 from ident.model.model_file import read_model
 from ident.rows.sessions import payload_name
 from lwr_driver.arm import Arm
 from lwr_driver.session import Session
 from runner.encoder import encoder_of
-from runner.estimation import known_arm
 from runner.experiment_file import Payload
 from runner.file_names import MODEL, SUMMARY
 from runner.replay import Replay, Replayed, attached_experiment
@@ -156,7 +156,7 @@ def motion_replay(
         models["extended"] = read_model(extended)
         if not models["extended"].effects and model is None:
             del models["extended"]
-    known = known_arm(arm, models["base"].structure.chain)
+    known = known_arm(models["base"].structure.chain, arm)
     if known is None:
         raise ConfigurationError(
             f"{source}: no arm file has these joints; name one with --arm, to draw the arm"

@@ -93,6 +93,14 @@ class Coupling:
 
     joints: tuple[str, str]
 
+    @classmethod
+    def of(cls, text: str) -> Coupling:
+        """The coupling written as `A5:A6`. Raises ConfigurationError for anything else."""
+        first, _, second = text.partition(":")
+        if not first or not second or first == second:
+            raise ConfigurationError(f"coupling {text!r} does not name two joints, such as A5:A6")
+        return cls((first, second))
+
 
 @dataclass(frozen=True, eq=False)
 class DriveMotion:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         Identification,
         IdentificationSettings,
         identify,
+        known_settings,
     )
     from ident.estimation.mounting import Mounting, find_mounting
     from ident.estimation.payload import PayloadEstimate, identify_payload, with_payload
@@ -52,6 +53,7 @@ __all__ = [
     "find_mounting",
     "identify",
     "identify_payload",
+    "known_settings",
     "mounted",
     "predictor",
     "prepared_session",
@@ -77,6 +79,7 @@ _HOMES = {
         "Identification",
         "IdentificationSettings",
         "identify",
+        "known_settings",
     ),
     ".mounting": (
         "Mounting",

@@ -14,6 +14,7 @@ import numpy as np
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.known_arm import known_arm
 from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructure, Side
 from ident.dynamics.tables import Tabular
 from ident.estimation.assumptions import Assumptions, check_assumptions, weak_parameters
@@ -416,13 +417,16 @@ def identify(
 
     sessions : a session, the path of a log, or several of either. The payload of each comes from its metadata
         (`none`: the bare arm). A session without motor or joint torques adds the rows of the other side only.
+    settings : default `known_settings`, with the result of `lwr-run identify`; given ones are taken as they are.
     known : of these sessions, from an earlier identification with the same signal settings; they are not screened
         again.
 
     Raises ConfigurationError for arguments of a wrong type, DataError for unusable sessions.
     """
-    settings = settings or IdentificationSettings()
     require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
+    if settings is None:
+        sessions = as_sessions(sessions)
+        settings = known_settings(sessions, chain)
     require(settings, IdentificationSettings, "settings", "make one with `IdentificationSettings(model=2)`")
     if settings.estimator == AUTO:
         from ident.estimation.choose import choose
@@ -430,6 +434,35 @@ def identify(
         return choose(sessions, chain, settings, known=known)
     rows = observed(sessions, chain, settings, known=known)
     return rows.identified(rows.settings)
+
+
+def known_settings(
+    sessions: Sessions,
+    chain: Chain,
+    settings: IdentificationSettings | None = None,
+    *,
+    model: int | None = None,
+) -> IdentificationSettings:
+    """The settings with what is known of arm and sessions, as of `lwr-run identify`.
+
+    settings : default those of the command, with the estimator `auto`. model : as asked for; None: Model 1 of sessions
+    without motor torques, else the settings'. Added are the stiffness of the arm's file, where the settings state none
+    and the chain has its joints, and the coupled drives that the sessions' metadata name.
+    """
+    settings = settings or IdentificationSettings(estimator=AUTO)
+    read = as_sessions(sessions)
+    if model is not None:
+        settings = replace(settings, model=model)
+    elif all(session.motor is None for session in read):
+        settings = replace(settings, model=1)
+    if not settings.couplings:
+        pairs = dict.fromkeys(pair for one in read for pair in one.metadata.get("couplings", "").split())
+        settings = replace(settings, couplings=tuple(Coupling.of(pair) for pair in pairs))
+    arm = known_arm(chain)
+    if arm is not None and settings.signals.stiffness_nm_rad is None:
+        signals = replace(settings.signals, stiffness_nm_rad=tuple(arm.stiffness.tolist()))
+        settings = replace(settings, signals=signals)
+    return settings
 
 
 def observed(

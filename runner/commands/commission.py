@@ -83,9 +83,9 @@ def command(
     """
     from fri.errors import ConfigurationError
     from ident.diagnosis import commission
+    from ident.dynamics.known_arm import known_arm
     from ident.import_log import read_recording
     from runner.diagnosis import arm_data, chain_of
-    from runner.estimation import known_arm
     from runner.experiment_file import Experiment
     from runner.files import locked
     from runner.status import StatusLine
@@ -112,7 +112,7 @@ def command(
     status.show("estimating the healthy arm")
     parts = [[read_recording(path, status=False) for path in part] for part in paths]
     chain = chain_of(parts[0], urdf)
-    data = arm_data(known_arm(arm, chain), chain, coupling, gear_ratio, stiffness)
+    data = arm_data(known_arm(chain, arm), chain, coupling, gear_ratio, stiffness)
     found = commission(parts, chain, arm=data)
     status.clear()
     found.save(out)

@@ -84,13 +84,14 @@ def command(
     """
     from fri.errors import ConfigurationError
     from ident.diagnosis.outcome.claims_in_words import SURE
+    from ident.dynamics.known_arm import known_arm
     from ident.import_log import read_recording
     from ident.model.model_file import read_model
     from runner.diagnosis import arm_data, asked, chain_of, study
     from runner.diagnosis.discriminating import offers_after_logs
     from runner.diagnosis.study import replaceable
     from runner.ending import compared, of_diagnosis
-    from runner.estimation import known_arm, recorded_couplings
+    from runner.estimation import recorded_couplings
     from runner.replay import attached_experiment
     from runner.report.page import write_diagnosis_report
     from runner.status import StatusLine
@@ -101,7 +102,7 @@ def command(
     logs = [read_recording(path, status=False) for path in sessions]
     held = [read_recording(path, status=False) for path in test]
     chain = chain_of(logs, urdf)
-    known = known_arm(arm, chain)
+    known = known_arm(chain, arm)
     pairs = [(asked(a, chain.joint_names), asked(b, chain.joint_names)) for a, b in compare]
     experiment = next((one for one in map(attached_experiment, logs) if one is not None), None)
     found = study(

@@ -133,7 +133,7 @@ def command(
     """
     # Imported on use: the help page needs none of them.
     from ident.dynamics.session_chain import session_chain
-    from ident.estimation.identify import identify
+    from ident.estimation.identify import identify, known_settings
     from ident.estimation.validate import validate
     from ident.model.model_file import write_model
     from runner.ending import of_estimate, of_folder
@@ -141,11 +141,8 @@ def command(
         IdentifySettings,
         announced,
         check_spans,
-        couplings,
-        known_from,
         named_model,
         of_file,
-        recorded_couplings,
     )
 
     read = IdentifySettings() if settings is None else IdentifySettings.load(settings)
@@ -161,11 +158,9 @@ def command(
     status = StatusLine()
     logs = read_recordings((*sessions, *test), urdf=urdf, folder=folder, base=base, tip=tip, **known)
     logs = announced(logs, payload, (*sessions, *test))
-    if not wanted.couplings:
-        wanted = replace(wanted, couplings=couplings(recorded_couplings(logs)))
     logs, tested = logs[: len(sessions)], logs[len(sessions) :]
     chain = session_chain(logs[0], urdf, base=base, tip=tip)
-    wanted = known_from(logs, chain, wanted, model)
+    wanted = known_settings(logs, chain, wanted, model=model)
     check_spans(logs, wanted, Path(settings or "settings"))
     mounting = None
     status.show("estimating the model")

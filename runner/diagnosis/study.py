@@ -18,6 +18,7 @@ from ident.diagnosis.outcome.look_alikes import LookAlikes, Place, look_alikes
 from ident.diagnosis.outcome.statements import Statements, statements
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.session_chain import session_chain
+from ident.dynamics.structure import Coupling
 from ident.effects import find_effect
 from ident.model import DynamicModel
 from ident.model.model_file import write_model
@@ -32,7 +33,6 @@ from runner.diagnosis.records import (
     Residuals,
     write_look_alikes,
 )
-from runner.estimation import couplings
 from runner.file_names import DETAILS, DIAGNOSIS
 from runner.replay import Replay
 from runner.terminal import write_json
@@ -213,7 +213,7 @@ def arm_data(
     coupling : each `A:B`, two joints with coupled drives. gear_ratio, stiffness [Nm/rad] : `N` for all joints or
     `N,N,...`, in place of the arm file's. Raises ConfigurationError for unknown joints and wrong numbers.
     """
-    pairs = couplings(coupling)
+    pairs = tuple(map(Coupling.of, coupling))
     for name in (name for pair in pairs for name in pair.joints):
         if name not in chain.joint_names:
             raise ConfigurationError(f"--coupling: no joint {name!r}; joints: {', '.join(chain.joint_names)}")

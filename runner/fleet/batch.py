@@ -19,14 +19,14 @@ import numpy as np
 
 from fri.errors import LwrError
 from ident.diagnosis import Reference, commission, diagnose
+from ident.dynamics.known_arm import known_arm
 from ident.dynamics.session_chain import session_chain
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identify import Identification, IdentificationSettings, identify, known_settings
 from ident.estimators.least_squares import factor_of
 from ident.model.model_file import read_model, write_model
 from ident.model.signals import signal_settings
 from lwr_driver.session import Session, read_session
 from runner.diagnosis import arm_data
-from runner.estimation import known_arm, known_from
 from runner.fleet.days import ArmDay
 from runner.fleet.store import ArmStore, FleetStore, Row
 from runner.fleet.together import write_together
@@ -176,7 +176,7 @@ def _read(day: ArmDay) -> tuple[list[Session], list[dict[str, Any]]]:
 
 def _identification(store: ArmStore, sessions: Sequence[Session], order: Order) -> Identification:
     chain = session_chain(sessions[0])
-    settings = known_from(sessions, chain, order.settings)
+    settings = known_settings(sessions, chain, order.settings)
     if store.model.is_file():
         model = read_model(store.model)
         signals = signal_settings(model)
@@ -258,7 +258,7 @@ def _reference(store: ArmStore, sets: Sequence[Sequence[Path]]) -> Reference:
     if found is None or not found.sets:
         read = [[read_session(path, status=False) for path in one] for one in sets]
         chain = session_chain(read[0][0])
-        data = arm_data(known_arm(None, chain), chain)
+        data = arm_data(known_arm(chain), chain)
         found = commission(read, chain, arm=data, robot=store.name)
         found.save(store.reference)
     return found
@@ -268,7 +268,7 @@ def _diagnosed(store: ArmStore, key: str, files: Sequence[Path], reference: Refe
     try:
         sessions = [read_session(path, status=False) for path in files]
         chain = session_chain(sessions[0])
-        data = arm_data(known_arm(None, chain), chain)
+        data = arm_data(known_arm(chain), chain)
         found = diagnose(sessions, chain, arm=data, reference=reference)
     except Exception as failure:
         return Progress(store.name, key, "diagnosed", _words(failure))

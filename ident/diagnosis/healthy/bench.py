@@ -19,6 +19,7 @@ from ident.diagnosis.rows.nominal_arm import STATED_WITHIN, NominalArm
 from ident.diagnosis.rows.recording import SessionRecord
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.known_arm import known_arm
 from ident.dynamics.structure import Coupling, Side
 from ident.effects import DELAYS, ELASTICITY, PRESLIDING, Shape
 from ident.estimators.physical import cad_prior, lacking_bodies
@@ -48,6 +49,12 @@ class ArmData:
     stiffness: Floats | None = None
     gear_ratio: Floats | None = None
     couplings: tuple[Coupling, ...] = ()
+
+    @classmethod
+    def of(cls, chain: Chain) -> ArmData:
+        """The data of the default arm file, if its joints are those of the chain, as the commands take them."""
+        arm = known_arm(chain)
+        return cls() if arm is None else cls(arm.stiffness, arm.gear_ratio.astype(float))
 
 
 @dataclass(eq=False)

@@ -11,6 +11,7 @@ import pytest
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics import Chain, numeric_base
+from ident.dynamics.structure import Coupling
 from ident.estimation import (
     IdentificationSettings,
     compare,
@@ -18,11 +19,13 @@ from ident.estimation import (
     find_mounting,
     identify,
     identify_payload,
+    known_settings,
     validate,
 )
 from ident.estimation.forward_simulation import simulate_session
 from ident.model import DynamicModel
 from ident.rows import SignalSettings, as_sessions
+from lwr_driver.arm import Arm
 
 PLAIN = SignalSettings(motor_delay_s=0.0)
 MODEL_1 = IdentificationSettings(model=1, signals=PLAIN)
@@ -41,6 +44,35 @@ def loaded(bench: Any) -> Any:
 @pytest.fixture(scope="module")
 def found(bench: Any, unloaded: Any) -> Any:
     return identify(unloaded, bench.chain, MODEL_1)
+
+
+def test_settings_of_a_known_arm_have_its_stiffness_and_those_given_stay(bench: Any, unloaded: Any) -> None:
+    stiffness = tuple(Arm.load().stiffness.tolist())
+    found = known_settings(unloaded, bench.chain)
+    assert (found.estimator, found.model, found.signals.stiffness_nm_rad) == ("auto", 2, stiffness)
+    own = SignalSettings(stiffness_nm_rad=(5e3,) * 7)
+    given = replace(MODEL_1, signals=own, couplings=(Coupling(("A5", "A6")),))
+    assert known_settings(unloaded, bench.chain, given) == given
+
+
+def test_settings_follow_the_sessions_and_an_unknown_arm_is_rigid(bench: Any, unloaded: Any) -> None:
+    sensed = replace(unloaded, motor=None, metadata=unloaded.metadata | {"couplings": "A5:A6"})
+    other = Chain.from_table([{"alpha": 0.0}, {"alpha": 1.0}])
+    found = known_settings([sensed], other)
+    assert (found.model, found.signals.stiffness_nm_rad) == (1, None)
+    assert found.couplings == (Coupling(("A5", "A6")),)
+    assert known_settings([sensed], other, model=2).model == 2
+
+
+def test_without_settings_the_result_is_that_of_the_command(
+    bench: Any, unloaded: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = []
+    monkeypatch.setattr(
+        "ident.estimation.choose.choose", lambda sessions, chain, settings, **known: taken.append(settings)
+    )
+    identify(unloaded.path, bench.chain)
+    assert taken == [known_settings(unloaded, bench.chain)]
 
 
 def bare(model: DynamicModel) -> DynamicModel:
