@@ -212,7 +212,12 @@ def import_log(
         unwrapped=tuple(turned),
         left_out=tuple(missing),
         periods=periods,
-        notes=(*recording.notes, *polled, *_strange_rate(float(np.median(steps))), *_jumping(mapping, joint)),
+        notes=(
+            *recording.notes,
+            *polled,
+            *_strange_rate(float(np.median(steps))),
+            *_jumping(mapping, channels),
+        ),
         conversions=_conversions(mapping),
         digests=recording.digests,
     )
@@ -436,14 +441,27 @@ def _once_each(channels: dict[str, _Channel]) -> tuple[dict[str, _Channel], list
     return once, [note]
 
 
-def _jumping(mapping: LogMapping, joint: _Channel) -> list[str]:
-    """Notes on positions that jump, as `identify` will tell them."""
+def _jumping(mapping: LogMapping, channels: Mapping[str, _Channel]) -> list[str]:
+    """Notes on positions that jump and on single wrong samples, as `identify` will tell them."""
     from ident.rows.data_quality import jumps  # on use: their import is slow
     from ident.screening.channels import jump_doubts
+    from ident.screening.spikes import position_spikes, torque_spikes
 
+    joint, names = channels["position"], mapping.joints
     times = (joint.times - joint.times[0]) * 1e-9
-    lengths = [mapping.position.unit == "m"] * len(mapping.joints)
-    return [str(doubt) for doubt in jump_doubts(jumps(times, joint.values), times, mapping.joints, lengths)]
+    slides = mapping.position.unit == "m"
+    lengths = [slides] * len(names)
+    found = [
+        *jump_doubts(jumps(times, joint.values), times, names, lengths),
+        *position_spikes(times, joint.values, names, lengths),
+    ]
+    for key in (key for key in ("joint_torque", "motor_torque") if key in channels):
+        one = channels[key]
+        units = ["N" if slides else "Nm"] * len(names)
+        found += torque_spikes(
+            (one.times - one.times[0]) * 1e-9, one.values, names, units, key.replace("_", " ")
+        )
+    return [str(doubt) for doubt in found]
 
 
 def _strange_rate(period: float) -> list[str]:

@@ -14,7 +14,9 @@ from ident.rows.data_quality import Jump, position_jumps, run_bounds
 from ident.rows.shared_rows import ROUNDED, SAME_ROWS, Cells, row_numbers, shared
 from ident.screening.doubts import Doubt, torques_of
 from ident.screening.speeds import check_speeds
+from ident.screening.spikes import check_spikes
 from ident.screening.stuck import dead_sensors, frozen_channels, never_moving, saturated, spans_in_words
+from ident.screening.unmeasured import check_unmeasured
 from lwr_driver.session import Session
 from lwr_driver.session.spool import column
 
@@ -32,13 +34,19 @@ _COPIED_S, _COPIED, _CHANGES = 1.0, 0.1, 20
 def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
     """Doubts about the channels of sessions with the joints of `chain`."""
     units = dict(zip(chain.joint_names, chain.torque_units, strict=True))
-    found = [*_repeated(sessions), *never_moving(sessions), *dead_sensors(sessions, units)]
+    found = [
+        *check_unmeasured(chain),
+        *_repeated(sessions),
+        *never_moving(sessions),
+        *dead_sensors(sessions, units),
+    ]
     for session in sessions:
         found += [*_copied(session), *_both_sides(session)]
         frozen = list(frozen_channels(session))
         named = {(doubt.channel, doubt.joints) for doubt in frozen}
         clipped = [doubt for doubt in saturated(session, units) if (doubt.channel, doubt.joints) not in named]
-        found += [*_clocks(session), *frozen, *_jumps(session, chain), *clipped, *check_speeds(session)]
+        found += [*_clocks(session), *frozen, *_jumps(session, chain), *check_spikes(session, chain)]
+        found += [*clipped, *check_speeds(session)]
     return found
 
 

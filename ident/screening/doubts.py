@@ -24,7 +24,7 @@ MEND_POSITION = (
 class Doubt:
     """One sentence about one channel of one session or of all.
 
-    channel : "position", "velocity", "joint torque", "motor torque", "time", "payload", "log".
+    channel : "position", "velocity", "joint torque", "motor torque", "time", "payload", "log", "spike", "kinematics".
     joints : names; empty for the channel as a whole. session : file name; empty for all sessions.
     certain : whether the data are worthless with it. lost : whether the channel holds nothing, and the rows do without.
     """

@@ -10,6 +10,7 @@ from ident.dynamics.parameters import Floats
 from ident.rows.data_quality import position_jumps
 from ident.rows.filters import median_step
 from ident.screening.doubts import LATE_S, MEND_TIME, MOVED, Doubt
+from ident.screening.spikes import spikes
 from lwr_driver.session import JointColumns, Session
 
 # Difference of dq/dt and velocity beyond filters and jitter; beyond the second one is a wrong unit.
@@ -111,9 +112,11 @@ def _speeds(joint: JointColumns) -> tuple[Floats, Floats, Floats] | None:
     ) / size
     slope = np.diff(joint.position[places], axis=0) / np.diff(time[places])[:, None]
     change = np.gradient(inner, 0.5 * (time[ends] + time[places[:-1]]), axis=0)
-    # A position that jumps says nothing of the speed.
+    # A position that jumps, or a wrong sample, says nothing of the speed.
     behind = np.array([jump.behind for jump in position_jumps(joint)], dtype=np.int64)
     whole = np.diff(np.searchsorted(behind, places, side="right")) == 0
+    wrong = np.count_nonzero(spikes(joint.position)[places], axis=1)
+    whole &= wrong[1:] + wrong[:-1] == 0
     return (inner[whole], slope[whole], change[whole]) if np.isfinite(inner).all() else None
 
 

@@ -30,6 +30,7 @@ _GROUPS = {
         "payload",
         "urdf",
         "tilt",
+        "without",
         "essential",
         "test",
         "settings",
