@@ -100,8 +100,7 @@ def batch_command(
     )
 
     def report(one: Progress) -> None:
-        day = "undated" if _undated(one.day) else one.day
-        write(f"{one.arm} {day} {one.what}{f': {one.error}' if one.error else ''}", stream=place)
+        write(f"{one.arm} {one.day} {one.what}{f': {one.error}' if one.error else ''}", stream=place)
 
     with _cluster(dask):
         order = Order(wanted, diagnose, reference_days, jobs)
@@ -183,23 +182,10 @@ def trend_command(arm: str | None, store: Path, out: Path | None, as_json: bool)
 
 
 def doubts(arms: Sequence[ArmTrend]) -> list[str]:
-    """Lines on arms with too few days for any change, and on logs without a date."""
-    from ident.monitoring.changes import LEAST_DAYS
+    """A line on logs without a date, none where all have one."""
+    from runner.fleet.page import UNDATED_ADVICE
 
-    lines = []
-    for one in arms:
-        if len(one.days) < LEAST_DAYS:
-            days = f"{len(one.days)} day{'s' * (len(one.days) != 1)}"
-            lines.append(f"{one.arm}: {days}, too few to tell a change; {LEAST_DAYS} are needed")
-    undated = [one.arm for one in arms if any(map(_undated, one.days))]
-    if undated:
-        lines.append(
-            f"undated logs of {', '.join(undated)} count as 1970-01-01: put the date into their path, such as "
-            "2026-03-12/"
-        )
-    return lines
-
-
-def _undated(day: object) -> bool:
-    """Whether a day is that of a clock without a date."""
-    return str(day).startswith("1970-")
+    undated = [one.arm for one in arms if one.undated]
+    if not undated:
+        return []
+    return [f"undated logs of {', '.join(undated)} have no part in any course: {UNDATED_ADVICE}"]

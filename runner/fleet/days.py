@@ -16,6 +16,10 @@ _ISO_DAY = re.compile(r"(?<!\d)(\d{4}-\d{2}-\d{2})(?!\d)")
 _UNSAFE = re.compile(r"[^\w.+-]+")
 
 
+UNDATED = date(1970, 1, 1)
+"""Day of the logs of a clock without a date, all of them together: it counts from zero."""
+
+
 @dataclass(frozen=True)
 class Log:
     """A log on disk. uid : its identity, the same in a copy."""
@@ -39,7 +43,28 @@ class ArmDay:
     @property
     def key(self) -> str:
         """The day, with the part from the second on; the name of its files in the store."""
-        return self.day.isoformat() + (f"_{self.part}" if self.part > 1 else "")
+        day = "undated" if self.day == UNDATED else self.day.isoformat()
+        return day + (f"_{self.part}" if self.part > 1 else "")
+
+
+def day_of(key: str) -> float:
+    """Days since year 1, of a day's key; later parts of a day follow within it. That of `UNDATED` without a date."""
+    match = re.fullmatch(r"(undated|\d{4}-\d{2}-\d{2})(?:_(\d+))?", key)
+    if match is None:
+        raise ValueError(f"{key!r} is no day")
+    day = UNDATED if match[1] == "undated" else date.fromisoformat(match[1])
+    return day.toordinal() + 0.01 * (int(match[2] or 1) - 1)
+
+
+def as_day(time: float) -> str:
+    """The day of `day_of` as text."""
+    day = date.fromordinal(int(time + 1e-6))
+    return "undated" if day == UNDATED else day.isoformat()
+
+
+def dated(key: str) -> bool:
+    """Whether a day's key tells a date."""
+    return as_day(day_of(key)) != "undated"
 
 
 @dataclass(frozen=True)
@@ -57,7 +82,7 @@ def find_days(places: Iterable[Path], known: Collection[str] = ()) -> Found:
 
     The arm is robot and serial number of the log; without a number, the first folder from the given one on
     without a date in its name. The day is a date such as 2026-03-12 in the path from the given folder on, the deepest
-    one; else the log's own.
+    one; else the log's own, or `UNDATED`.
     DataError where there is no log at all.
     """
     groups: dict[tuple[str, date], list[Log]] = {}
@@ -118,9 +143,10 @@ def _day(dated: Sequence[str], metadata: dict[str, str], first_ns: int) -> date:
             except ValueError:
                 continue
     try:
-        return datetime.fromisoformat(metadata.get("utc_start", "")).date()
+        own = datetime.fromisoformat(metadata.get("utc_start", "")).date()
     except ValueError:
-        return datetime.fromtimestamp(1e-9 * first_ns, UTC).date()
+        own = datetime.fromtimestamp(1e-9 * first_ns, UTC).date()
+    return UNDATED if own.year == UNDATED.year else own
 
 
 def _hash(path: Path) -> str:

@@ -8,14 +8,17 @@ import numpy as np
 
 from ident.diagnosis.outcome.statements import Number
 from ident.monitoring import Series
+from ident.monitoring.changes import LEAST_DAYS
 from runner.computer import versions
-from runner.fleet.trend import ArmTrend, FleetTrend, Named, as_day
+from runner.fleet.days import as_day
+from runner.fleet.trend import ArmTrend, FleetTrend, Named
 from runner.report.figure import Figure
 from runner.report.markup import Cell, figure_html, fold, paragraph, section, table
 from runner.report.page import page_html
 from runner.report.plot import Line, Mark, Panel, Points
 from runner.report.verdicts import Level, Verdict
 
+UNDATED_ADVICE = "put the date into their path, such as 2026-03-12/"
 _HEAD = ("quantity", "course", "since", "before", "after", "unit", "change [%]", "chance")
 
 
@@ -23,7 +26,9 @@ def arm_html(trend: ArmTrend) -> str:
     """The page of an arm: changes, findings, and every quantity over the days."""
     changed = {one.change.name for one in trend.changes}
     parts = [("changes", "Changes"), ("findings", "Findings"), ("days", "All quantities")]
-    content = section("changes", "Changes", _changes_table(trend.changes), _panels(trend, changed))
+    content = section(
+        "changes", "Changes", _changes_table(trend.changes, trend.doubt), _panels(trend, changed)
+    )
     if trend.findings:
         rows: list[list[Cell]] = [
             [
@@ -42,7 +47,7 @@ def arm_html(trend: ArmTrend) -> str:
     level, sentence = _verdict(trend)
     return page_html(
         trend.arm,
-        escape(f"{trend.arm} over {len(trend.days)} days"),
+        escape(f"{trend.arm} over {trend.count} day{'s' * (trend.count != 1)}"),
         (level, sentence),
         _lines(trend),
         content,
@@ -57,7 +62,7 @@ def fleet_html(fleet: FleetTrend) -> str:
     for arm in fleet.arms:
         first = str(arm.changes[0]) if arm.changes else "–"
         found = next((row["statement"] for row in arm.first_findings.values()), "–")
-        counts = [Number(float(len(items)), ".0f") for items in (arm.days, arm.changes)]
+        counts = [Number(float(count), ".0f") for count in (arm.count, len(arm.changes))]
         rows.append([arm.arm, *counts, first, found])
     head: tuple[str, ...] = ("arm", "days", "changes", "first change", "first finding")
     content = section("arms", "Arms", table(head, rows, "All arms"))
@@ -83,11 +88,23 @@ def fleet_html(fleet: FleetTrend) -> str:
     for arm in fleet.arms:
         for name, day in arm.new_payloads.items():
             lines.append(Verdict(arm.arm, f"payload {name} since {day}", "as before", "look", "arms"))
-    sentence = f"{len(moved) or 'none'} of {len(fleet.arms)} arms changed"
+    short = [arm for arm in fleet.arms if arm.doubt and not arm.changes]
+    lines += [Verdict(arm.arm, arm.doubt, f"at least {LEAST_DAYS} days", "look", "arms") for arm in short]
+    undated = [arm.arm for arm in fleet.arms if arm.undated]
+    if undated:
+        lines.append(Verdict("undated logs", f"of {', '.join(undated)}", UNDATED_ADVICE, "look", "arms"))
+    lines += [
+        Verdict(one.arm, f"unlike the others in {one.name}", "like the others", "look", "unlike")
+        for one in fleet.strange
+    ]
+    counted = len(fleet.arms) - len(short)
+    sentence = f"{len(moved) or 'none'} of {counted} arms changed" if counted else "no change can be told"
+    if short:
+        sentence += f"; {len(short)} of {len(fleet.arms)} arms have too few days, {LEAST_DAYS} are needed"
     return page_html(
         "Fleet",
         escape(f"Fleet of {len(fleet.arms)} arms"),
-        ("look" if moved else "good", sentence),
+        ("look" if lines else "good", sentence),
         lines,
         content,
         [("arms", "Arms"), ("unlike", "Unlike the others")],
@@ -96,8 +113,10 @@ def fleet_html(fleet: FleetTrend) -> str:
 
 
 def _verdict(trend: ArmTrend) -> tuple[Level, str]:
+    if not trend.changes and trend.doubt:
+        return "look", trend.doubt
     if not trend.changes:
-        return "good", f"no change in {len(trend.days)} days beyond the scatter from day to day"
+        return "good", f"no change in {trend.count} days beyond the scatter from day to day"
     first = trend.changes[0]
     more = len(trend.changes) - 1
     return "look", f"{first}" + (f", and {more} more" if more else "")
@@ -108,10 +127,16 @@ def _lines(trend: ArmTrend) -> list[Verdict]:
     for name, day in trend.new_payloads.items():
         lines.append(Verdict("payload", f"{name} since {day}", "as before", "look"))
     lines += [Verdict("estimate", f"{day}: {reason}", "every day", "bad") for day, reason in trend.failed[:5]]
+    if trend.undated:
+        lines.append(Verdict("undated logs", "no part of any course", UNDATED_ADVICE, "look"))
+    if trend.doubt:
+        lines.append(Verdict("days", trend.doubt, f"at least {LEAST_DAYS}", "look", "days"))
     return lines or [Verdict("changes", "none", "none", "good", "changes")]
 
 
-def _changes_table(found: tuple[Named, ...]) -> str:
+def _changes_table(found: tuple[Named, ...], doubt: str) -> str:
+    if not found and doubt:
+        return paragraph(f"No change can be told: {doubt}.")
     if not found:
         return paragraph("No quantity changed beyond its scatter from day to day.")
     rows: list[list[Cell]] = [

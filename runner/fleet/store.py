@@ -26,6 +26,7 @@ import numpy as np
 from fri.errors import ConfigurationError, DataError
 from ident.estimators.problem import TriangularFactor
 from runner.file_names import MODEL
+from runner.fleet.days import dated, day_of
 
 TABLES: Mapping[str, Sequence[tuple[str, str]]] = {
     "parameters": (("name", "string"), ("unit", "string"), ("value", "float64"), ("std", "float64")),
@@ -51,7 +52,7 @@ TABLES: Mapping[str, Sequence[tuple[str, str]]] = {
         ("note", "string"),
     ),
 }
-"""Columns of each table with their types, after `arm`, `day` and `part`."""
+"""Columns of each table with their types, after `arm`, `day` (null without a date) and `part`."""
 
 Row = Mapping[str, Any]
 
@@ -84,7 +85,7 @@ class ArmStore:
 
     def days(self) -> tuple[str, ...]:
         """Keys of the days with results, in order."""
-        return tuple(sorted(path.stem for path in (self.folder / "sessions").glob("*.parquet")))
+        return tuple(sorted((path.stem for path in (self.folder / "sessions").glob("*.parquet")), key=day_of))
 
     def write(self, key: str, table: str, rows: Sequence[Row]) -> None:
         """Write a day's rows of a table, whole or not at all."""
@@ -95,7 +96,9 @@ class ArmStore:
         kinds = {"string": pyarrow.string(), "float64": pyarrow.float64(), "int64": pyarrow.int64()}
         columns = {
             "arm": pyarrow.array([self.name] * len(rows), pyarrow.string()),
-            "day": pyarrow.array([date.fromisoformat(day)] * len(rows), pyarrow.date32()),
+            "day": pyarrow.array(
+                [date.fromisoformat(day) if dated(key) else None] * len(rows), pyarrow.date32()
+            ),
             "part": pyarrow.array([int(part or 1)] * len(rows), pyarrow.int64()),
         }
         for name, kind in TABLES[table]:

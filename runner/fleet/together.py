@@ -10,8 +10,9 @@ import numpy as np
 from ident.estimators.problem import TriangularFactor
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import read_model, write_model
+from runner.fleet.days import day_of
 from runner.fleet.store import ArmStore
-from runner.fleet.trend import arm_trend, day_of
+from runner.fleet.trend import arm_trend
 
 # Least number of days for a standard deviation from the differences of days.
 _LEAST_DAYS = 5

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import date
 from typing import Any
 
 import numpy as np
 
 from ident.monitoring import Change, Series, Unlike, changes, day_scatter, unlike
+from ident.monitoring.changes import LEAST_DAYS
+from runner.fleet.days import UNDATED, as_day, dated, day_of
 from runner.fleet.store import ArmStore, FleetStore
 
 _ERROR = "error of "
@@ -88,6 +88,25 @@ class ArmTrend:
     failed: tuple[tuple[str, str], ...]
 
     @property
+    def count(self) -> int:
+        """Number of days with a date."""
+        return len({key.partition("_")[0] for key in self.days if dated(key)})
+
+    @property
+    def doubt(self) -> str:
+        """Why no change can be told, empty where one can: too few days, those without a date apart."""
+        count = self.count
+        if count >= LEAST_DAYS:
+            return ""
+        days = "no day with a date" if not count else "1 day" if count == 1 else f"{count} days"
+        return f"{days}, too few to tell a change; {LEAST_DAYS} are needed"
+
+    @property
+    def undated(self) -> bool:
+        """Whether there are logs without a date."""
+        return not all(map(dated, self.days))
+
+    @property
     def first_days(self) -> set[str]:
         """Keys of the first days after each change, the latest in question."""
         found = set()
@@ -130,9 +149,8 @@ class ArmTrend:
         }
 
     def __str__(self) -> str:
-        lines = [
-            f"{self.arm}: {len(self.days)} days, {self.days[0]} to {self.days[-1]}" if self.days else self.arm
-        ]
+        known = [key for key in self.days if dated(key)]
+        lines = [f"{self.arm}: {len(known)} days, {known[0]} to {known[-1]}" if len(known) > 1 else self.arm]
         lines += [f"  {one}" for one in self.changes]
         lines += [f"  payload {name} since {day}" for name, day in self.new_payloads.items()]
         lines += [
@@ -140,7 +158,9 @@ class ArmTrend:
             for row in self.first_findings.values()
         ]
         lines += [f"  {day}: no estimate: {reason}" for day, reason in self.failed]
-        if len(lines) == 1:
+        if self.doubt and not self.changes:
+            lines.append(f"  {self.doubt}")
+        elif len(lines) == 1:
             lines.append("  no change beyond its scatter from day to day")
         return "\n".join(lines)
 
@@ -164,10 +184,11 @@ class FleetTrend:
             arm for arm in self.arms if not (arm.changes or arm.findings or arm.new_payloads or arm.failed)
         ]
         lines = [str(arm) for arm in self.arms if arm not in calm]
-        if calm:
-            lines.append(
-                f"{len(calm)} of {len(self.arms)} arms without a change: {', '.join(a.arm for a in calm)}"
-            )
+        sure, short = ([arm for arm in calm if bool(arm.doubt) == few] for few in (False, True))
+        for some, what in ((sure, "without a change"), (short, "with too few days to tell a change")):
+            if some:
+                names = ", ".join(arm.arm for arm in some)
+                lines.append(f"{len(some)} of {len(self.arms)} arms {what}: {names}")
         for one in self.strange:
             lines.append(
                 f"{one.arm} is unlike the others: {one.name} {one.value:.4g}, the others {one.median:.4g} +- "
@@ -188,7 +209,7 @@ def _judged(store: ArmStore, known: _Known, usual: Mapping[str, float]) -> ArmTr
     found = [
         Named(change, units[name], "error" if name.startswith(_ERROR) else "parameter")
         for name, one in series.items()
-        for change in changes(one, level)
+        for change in changes(_dated(one), level)
         if not abs(change.percent) < _LEAST_PERCENT
     ]
     sessions = store.read("sessions")
@@ -262,21 +283,14 @@ def _read(store: ArmStore) -> _Known:
     return {name: (_series(name, values), units[name]) for name, values in columns.items()}
 
 
+def _dated(series: Series) -> Series:
+    """The course without the day of undated logs, whose place in it nobody knows."""
+    known = series.time != UNDATED.toordinal()
+    return replace(series, time=series.time[known], values=series.values[known], std=series.std[known])
+
+
 def _series(name: str, values: Mapping[str, tuple[float, float]]) -> Series:
     keys = sorted(values, key=day_of)
     time = np.array([day_of(key) for key in keys])
     numbers = np.array([values[key] for key in keys])
     return Series(name, time, numbers[:, 0], np.where(np.isfinite(numbers[:, 1]), numbers[:, 1], 0.0))
-
-
-def day_of(key: str) -> float:
-    """Days since year 1, of a day's key; later parts of a day follow within it."""
-    match = re.fullmatch(r"(\d{4}-\d{2}-\d{2})(?:_(\d+))?", key)
-    if match is None:
-        raise ValueError(f"{key!r} is no day")
-    return date.fromisoformat(match[1]).toordinal() + 0.01 * (int(match[2] or 1) - 1)
-
-
-def as_day(time: float) -> str:
-    """The day of `day_of` as text."""
-    return date.fromordinal(int(time + 1e-6)).isoformat()

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from ident.diagnosis.outcome.look_alikes import LookAlikes
 from lwr_driver.session import describe
-from runner.commands.fleet import doubts
 from runner.ending import compared, numbers_of, of_session
 from tests.lwr_driver.session.test_reader import plain_messages, ros_session
 
@@ -115,18 +113,6 @@ def test_a_comparison_of_causes_asked_for_has_a_line() -> None:
     assert name == "cable_spring A4 or base_tilt"
     assert value.startswith("told apart by these sessions: overlap 0.250, rest 38.7")
     assert compared(replace(pair, alike=1.0), ("A1",) * 5)[1].startswith("not told apart")
-
-
-def test_few_days_and_days_without_a_date_are_no_sign_of_health() -> None:
-    arms: Any = [
-        SimpleNamespace(arm="one", days=["1970-01-01"]),
-        SimpleNamespace(arm="long", days=[f"2026-03-0{day}" for day in range(1, 7)]),
-    ]
-    assert doubts(arms) == [
-        "one: 1 day, too few to tell a change; 5 are needed",
-        "undated logs of one count as 1970-01-01: put the date into their path, such as 2026-03-12/",
-    ]
-    assert doubts(arms[1:]) == []
 
 
 @pytest.mark.parametrize(
