@@ -217,6 +217,7 @@ class Identification(Tabular):
                     "payload": payload,
                     "rows": session.counts["rows"],
                     "lost_samples": session.counts["lost"],
+                    "old_samples": session.counts["stale"],
                     "motor_delay_s": session.delay.seconds if session.delay is not None else None,
                     "motor_delay_std_s": session.delay.std or None if session.delay is not None else None,
                     "joint_delay_s": session.joint_delay.seconds if session.joint_delay is not None else None,
@@ -285,12 +286,13 @@ class Identification(Tabular):
                 delay += f", joint torques {session.joint_delay}"
             lines.append(
                 f"{session.name}: payload {payload or 'none'}, {session.counts['rows']} rows, "
-                f"{session.counts['lost']} samples lost{delay}"
+                f"{session.counts['lost']} samples lost, {session.counts['stale']} repeated or older than their "
+                f"stamps{delay}"
             )
             if session.jitter_s is not None:
                 lines.append(
                     f"{session.name}: stamps jitter by {1e3 * session.jitter_s:.2g} ms rms about an even sample time; "
-                    f"times counted by the motion, {session.counts['stale']} repeated samples left out"
+                    "times counted by the motion"
                 )
         lines += self.known.signal_reasons
         lines.append(self._condition)

@@ -7,6 +7,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,11 @@ from ident.import_log.recording import Recording
 from ident.import_log.tables import Floats
 from ident.import_log.turns import unwrapped
 from lwr_driver.configuration import find, yaml_text
-from lwr_driver.session import SessionWriter, session_metadata
+from lwr_driver.session import JointColumns, SessionWriter, session_metadata
 from lwr_driver.session.spool import spans, stored
+
+if TYPE_CHECKING:
+    from ident.rows.sample_count import SampleCount
 
 _ONCE = ("position", "velocity", "joint_torque")
 # Signals of one topic: their rows are written or left out together.
@@ -44,7 +48,8 @@ class ImportReport:
     period_s, shortest_s, longest_s : median, least and greatest time between samples of `/joint_states` [s].
     unwrapped : angles that wrapped, and where.
     left_out : rows without one of their values, by topic; they count as lost samples.
-    holes : intervals longer than 1.75 periods, probably with lost samples.
+    holes : intervals longer than 1.75 periods. lost, old : samples that never came, and those that an estimate leaves
+        out as repeated or older than their stamps; the counts of `identify`.
     repeated : samples equal to the one before in every value; they are kept.
     periods : of the excitation, marked in the session; None for a motion without.
     notes : decisions on the way that the user should know.
@@ -61,6 +66,8 @@ class ImportReport:
     shortest_s: float
     longest_s: float
     holes: int
+    lost: int
+    old: int
     repeated: int
     unwrapped: tuple[str, ...]
     left_out: tuple[str, ...]
@@ -72,7 +79,9 @@ class ImportReport:
     def __str__(self) -> str:
         written = ", ".join(f"{topic} {count}" for topic, count in self.rows.items())
         jitter = "regular" if self.longest_s - self.shortest_s < 1e-6 else "kept as recorded"
-        lost = [f"  holes     {self.holes} intervals longer than 1.75 periods: lost samples"]
+        lost = f"  lost      {self.lost} samples"
+        lost += f"; {self.holes} intervals are longer than 1.75 periods" if self.holes else ""
+        old = f"  old       {self.old} samples repeated or older than their stamps, left out of estimates"
         share = 100.0 * self.repeated / self.rows["/joint_states"]
         percent = f"{share:.0f}" if share >= 10.0 else f"{share:.2g}"
         again = [
@@ -83,8 +92,9 @@ class ImportReport:
             f"  rows      {written} (recording: {self.rows_in_source})",
             f"  period    median {self.period_s * 1e3:.4g} ms, {self.shortest_s * 1e3:.4g} to "
             f"{self.longest_s * 1e3:.4g} ms, {jitter}",
-            *(lost if self.holes else ()),
+            *((lost,) if self.holes or self.lost else ()),
             *(again if self.repeated else ()),
+            *((old,) if self.old else ()),
             *(f"  left out  {missing}" for missing in self.left_out),
             *(f"  unwrapped {turned}" for turned in self.unwrapped),
             *((f"  periods   {self.periods}",) if self.periods is not None else ()),
@@ -196,6 +206,7 @@ def import_log(
         if key in channels
     }
     steps = np.diff(joint.times) * 1e-9
+    count = _count(mapping, channels)
     return ImportReport(
         path=Path(output),
         robot=mapping.robot,
@@ -208,6 +219,8 @@ def import_log(
         shortest_s=float(steps.min()),
         longest_s=float(steps.max()),
         holes=int(np.count_nonzero(steps > 1.75 * np.median(steps))),
+        lost=count.lost,
+        old=count.old,
         repeated=_repeated(channels),
         unwrapped=tuple(turned),
         left_out=tuple(missing),
@@ -407,6 +420,26 @@ def _repeated(channels: Mapping[str, _Channel]) -> int:
             block = values[some.start : some.stop + 1]
             alike[some] &= (block[1:] == block[:-1]).all(axis=1)
     return int(np.count_nonzero(alike))
+
+
+def _count(mapping: LogMapping, channels: Mapping[str, _Channel]) -> SampleCount:
+    """Lost and old samples of `/joint_states`, as `identify` counts them."""
+    from ident.rows.sample_count import sample_count  # on use: its import is slow
+
+    joint, torque = channels["position"], channels.get("joint_torque")
+    none = np.zeros((len(joint.times), 0))
+    return sample_count(
+        JointColumns(
+            "/joint_states",
+            mapping.joints,
+            joint.times,
+            joint.published,
+            np.arange(len(joint.times)),
+            joint.values,
+            none,
+            none if torque is None else torque.values,
+        )
+    )
 
 
 def _once_each(channels: dict[str, _Channel]) -> tuple[dict[str, _Channel], list[str]]:

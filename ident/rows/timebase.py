@@ -107,6 +107,12 @@ def sample_period(times: Floats, counts: NDArray[np.int64] | None, where: str) -
     return float(np.median(step))
 
 
+def missing_samples(times: Floats, dt: float) -> int:
+    """Number of samples missing between others at times (n,), in intervals longer than 1.75 sample times dt [s]."""
+    intervals = np.diff(times)
+    return int(np.sum(np.maximum(np.rint(intervals[intervals > 1.75 * dt] / dt) - 1, 0)))
+
+
 def stretches(
     times: Floats,
     columns: Floats | tuple[Floats, ...],
@@ -124,8 +130,7 @@ def stretches(
     good = np.flatnonzero(~bad)
     if len(good) < 16:
         return [], 0
-    intervals = np.diff(times)
-    lost = int(np.sum(np.maximum(np.rint(intervals[intervals > 1.75 * dt] / dt) - 1, 0)))
+    lost = missing_samples(times, dt)
     hole = np.diff(times[good]) > longest_bridge_s + 1.75 * dt
     for sample in behind:
         # The good samples before and behind it are no neighbours.

@@ -461,14 +461,19 @@ class SessionSummary:
         """Name and mass of the payload."""
         return _payload(self.metadata)
 
+    @property
+    def counted(self) -> bool:
+        """Whether the source counts its samples: in an import the counter is the number of the row."""
+        return self.metadata.get("experiment") != "import"
+
     def topics(self) -> Listing:
-        """Samples, rate, lost samples and longest pause of each topic."""
+        """Samples, rate, lost samples by the source's counter and longest pause of each topic."""
         rows = [
             (
                 item.topic,
                 f"{item.samples}",
                 f"{item.rate_hz:.1f}",
-                f"{item.lost}",
+                f"{item.lost}" if self.counted else "-",
                 f"{item.longest_pause_s * 1e3:.1f}",
             )
             for item in self.channels

@@ -87,7 +87,8 @@ def _signal_table(results: ResultFolder) -> str:
     """What the estimate made of each session: rows, lost samples, delays, cut-off."""
     rows: list[list[Cell]] = []
     for number, entry in enumerate(results.summary["prepared"]):
-        counts = (Number(entry[key], "d", f"prepared.{number}.{key}") for key in ("rows", "lost_samples"))
+        keys = ("rows", "lost_samples", "old_samples")
+        counts = (Number(entry.get(key), "d", f"prepared.{number}.{key}") for key in keys)
         delays = (
             entry.get(key)
             for key in ("motor_delay_s", "motor_delay_std_s", "joint_delay_s", "joint_delay_std_s")
@@ -96,7 +97,8 @@ def _signal_table(results: ResultFolder) -> str:
         milliseconds = (Number(None if value is None else 1e3 * value, ".2f") for value in delays)
         rows.append([entry["name"], *counts, *milliseconds, cutoff])
     head = (
-        "session", "rows", "lost samples", "motor torque late by [ms]", "± [ms]", "joint torque late by [ms]", "± [ms]",
+        "session", "rows", "lost samples", "repeated or old",
+        "motor torque late by [ms]", "± [ms]", "joint torque late by [ms]", "± [ms]",
         "cut-off [Hz]",
     )  # fmt: skip
     reasons = results.summary["signals"]["reasons"]

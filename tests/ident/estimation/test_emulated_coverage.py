@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from ident.estimation.identify import Identification, identify
+from ident.estimation.identify import Identification, IdentificationSettings, identify
 from runner.published import TABLE_2
 from tests.ident.estimation.emulated_sessions import record_pair
 from tests.ident.estimation_arm import chain, true_base
@@ -23,7 +23,10 @@ SEEDS = (11, 12, 13)
 @pytest.fixture(scope="module")
 def pairs(tmp_path_factory: pytest.TempPathFactory) -> list[Identification]:
     folder = tmp_path_factory.mktemp("pairs")
-    return [identify(record_pair(folder, seed, period_s=12.0), chain()) for seed in SEEDS]
+    return [
+        identify(record_pair(folder, seed, period_s=12.0), chain(), IdentificationSettings())
+        for seed in SEEDS
+    ]
 
 
 @lru_cache

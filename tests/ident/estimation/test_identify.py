@@ -36,7 +36,7 @@ def sessions(**changes):
 
 @lru_cache
 def model_2() -> Identification:
-    return identify(sessions(command=True), arm.chain())
+    return identify(sessions(command=True), arm.chain(), IdentificationSettings())
 
 
 def errors(found: Identification) -> np.ndarray:
@@ -102,7 +102,7 @@ def test_model_3_finds_the_drives_from_the_difference():
 
 def test_a_session_without_motor_torques_adds_its_joint_rows():
     bare, loaded = sessions()
-    found = identify([dataclasses.replace(bare, motor=None), loaded], arm.chain())
+    found = identify([dataclasses.replace(bare, motor=None), loaded], arm.chain(), IdentificationSettings())
     assert found.counts["base"] == 102
     assert np.mean(np.abs(errors(found)) < 3) >= 0.95
 
@@ -176,19 +176,19 @@ def test_essential_lists_reach_the_result():
 
 def test_without_motor_torques_model_1_is_offered():
     with pytest.raises(DataError, match="choose Model 1"):
-        identify(sessions(motor=False), arm.chain())
+        identify(sessions(motor=False), arm.chain(), IdentificationSettings())
 
 
 def test_no_session_is_refused():
     with pytest.raises(DataError, match="no session"):
-        identify([], arm.chain())
+        identify([], arm.chain(), IdentificationSettings())
 
 
 def test_sessions_of_two_robots_are_refused():
     bare, loaded = sessions()
     other = dataclasses.replace(loaded, metadata={**loaded.metadata, "robot": "iiwa14"})
     with pytest.raises(DataError, match="different robots"):
-        identify([bare, other], arm.chain())
+        identify([bare, other], arm.chain(), IdentificationSettings())
 
 
 def test_joint_names_of_another_arm_are_refused():

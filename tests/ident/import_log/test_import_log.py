@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,10 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.session_chain import session_chain
 from ident.import_log import LogMapping, import_log
 from ident.import_log.tables import read_text
+from ident.rows.prepare import prepare
 from lwr_driver.configuration import CONFIGS, parse
 from lwr_driver.session import read_session
+from lwr_driver.session.session import summarise
 from runner.cli import main
 
 JOINTS = ["a", "b"]
@@ -292,9 +295,32 @@ def test_a_mapping_that_makes_no_sense_is_refused(changes: dict[str, Any], messa
 def test_lost_samples_are_counted_in_the_report(tmp_path: Path) -> None:
     times = np.delete(np.arange(20) * 0.01, [5, 6, 12])
     report = import_log(mapping(), write_csv(tmp_path, 17, t=times), tmp_path / "x.mcap")
-    assert report.holes == 2
-    assert "2 intervals longer than 1.75 periods" in str(report)
+    assert (report.holes, report.lost) == (2, 3)
+    assert "  lost      3 samples; 2 intervals are longer than 1.75 periods\n" in str(report)
     assert "kept as recorded" in str(report)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_an_import_counts_lost_and_old_samples_as_an_estimate_does(tmp_path: Path, jitter: float) -> None:
+    rng = np.random.default_rng(3)
+    number = np.delete(np.arange(4000), rng.choice(4000, 200, replace=False))
+    old = rng.choice(len(number) - 10, 100, replace=False) + 5
+    number[old] = number[old - 1]  # a late sample is read twice
+    time = number * 2e-3
+    columns = {"qa": np.sin(time), "qb": np.cos(1.3 * time), "ta": np.sin(2 * time), "tb": np.cos(time)}
+    stamps = np.delete(np.arange(4000), rng.choice(4000, 200, replace=False)) * 2e-3
+    stamps = np.sort(stamps + jitter * 2e-3 * rng.uniform(size=len(stamps)))
+    report = import_log(
+        mapping(), write_csv(tmp_path, len(stamps), t=stamps, **columns), tmp_path / "out.mcap"
+    )
+    counts = prepare(read_session(tmp_path / "out.mcap"), motor=False, log=False).counts
+    assert (report.lost, report.old) == (counts["lost"], counts["stale"])
+    assert report.old > 50
+    assert f"  lost      {report.lost} samples" in str(report)
+    # An import counts its rows, not the samples of the source.
+    topics = str(summarise(read_session(tmp_path / "out.mcap")).topics())
+    assert f"{report.lost}" not in topics
+    assert re.search(r"/joint_states +\d+ +[\d.]+ +- ", topics)
 
 
 def test_missing_column_and_missing_file_name_what_there_is(tmp_path: Path) -> None:
