@@ -22,7 +22,7 @@ STYLES = {"good": "green", "look": "yellow", "bad": "red"}
 
 # Verdict words in the cells of tables.
 _VERDICTS = {
-    **dict.fromkeys(("ok", "good", "yes", "holds", "kept"), "green"),
+    **dict.fromkeys(("ok", "good", "yes", "holds", "harmless", "kept"), "green"),
     **dict.fromkeys(("look", "note", "hint", "differs", "advice"), "yellow"),
     **dict.fromkeys(("FAIL", "bad", "NO", "VIOLATED", "violated"), "bold red"),
 }

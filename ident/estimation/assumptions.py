@@ -30,7 +30,14 @@ from ident.estimators.estimate import Estimate, chi_square_tail, fisher_tail, no
 from ident.estimators.problem import Problem, condition_text
 from lwr_driver.listing import Listing, Piece, text_of
 
+HARMLESS = "harmless"
+IN_WORDS = (
+    "harmless: a departure beyond chance that the standard deviations allow for, or whose remedy moves no result that "
+    "matters"
+)
 _LEVEL = 0.01
+# A mean by rounding, over what matters.
+_ROUNDING = 1e-6
 # Share of a joint's torque that matters: the accuracy of joint torque sensors.
 _MATTERS = 0.02
 # Half width of a 95 % interval in standard deviations.
@@ -47,7 +54,7 @@ _HUBER = 1.345
 
 @dataclass(frozen=True)
 class Check:
-    """One assumption: whether it holds (None: not testable), finding and consequence."""
+    """One assumption: whether it holds in its consequence (None: not testable), finding and consequence."""
 
     name: str
     holds: bool | None
@@ -58,7 +65,9 @@ class Check:
 
     @property
     def verdict(self) -> str:
-        """`holds`, `violated` or `not tested`."""
+        """`holds`, `harmless` (a departure beyond chance without consequence), `violated` or `not tested`."""
+        if self.holds and self.p_value <= _LEVEL:
+            return HARMLESS
         return {True: "holds", False: "VIOLATED", None: "not tested"}[self.holds]
 
 
@@ -85,8 +94,10 @@ class Assumptions(Tabular):
     def pieces(self) -> list[Piece]:
         """The same as a table, and the consequence of what does not hold."""
         rows = [(check.name, check.verdict, check.finding) for check in self.checks]
+        harmless = any(check.verdict == HARMLESS for check in self.checks)
         return [
             Listing(("assumption", "verdict", "finding"), rows, 0),
+            *((f"  {IN_WORDS}",) if harmless else ()),
             *(f"  {check.name}: {check.consequence}" for check in self.checks if not check.holds),
         ]
 
@@ -185,10 +196,12 @@ def _mean(series: list[_Series]) -> Check:
     large = int(np.argmax(beyond))
     if beyond[large] > 1.0:
         k = large
+    mean = float(np.mean(series[k].residual))
+    shown = mean if abs(mean) > _ROUNDING * limits[k] else 0.0
     return Check(
         "zero mean",
         p_value > _LEVEL or beyond[large] <= 1.0,
-        f"largest mean {np.mean(series[k].residual):.3g} {series[k].unit} ({series[k].label}, "
+        f"largest mean {shown:.3g} {series[k].unit} ({series[k].label}, "
         f"{limits[k]:.3g} {series[k].unit} matters), "
         f"{abs(scores[k]):.1f} standard errors",
         "an offset is missing from the model there",
@@ -288,8 +301,8 @@ def _normality(series: list[_Series], problem: Problem, estimate: Estimate) -> C
 class _Moved(NamedTuple):
     """Consequence of another estimate: the parameter and the computed torque that it moves most.
 
-    deviations : of the parameter, in its standard deviations. torque : rms in the rows of `label`; limit : what matters
-        there [Nm].
+    deviations : of the parameter, in its standard deviations; with a prior only the torque is told. torque : rms in the
+        rows of `label`; limit : what matters there [Nm].
     """
 
     name: str
@@ -303,7 +316,8 @@ class _Moved(NamedTuple):
     def by(cls, problem: Problem, estimate: Estimate, series: Sequence[_Series], shift: Floats) -> _Moved:
         """Of a shift (p,) of the parameters."""
         own = np.abs(shift) / np.maximum(estimate.std, 1e-300)
-        index = int(np.argmax(own))
+        # With a prior, parameters that the rows hardly show stay where it has them; the step knows nothing of it.
+        index = int(np.argmax(own)) if estimate.prior_scale is None else None
         torques = []
         for row_class in problem.classes:
             parts = np.concatenate([problem.groups[k].matrix @ shift for k in row_class.groups])
@@ -313,9 +327,8 @@ class _Moved(NamedTuple):
         k = int(
             np.argmax([torque / max(limit, 1e-300) for torque, limit in zip(torques, limits, strict=True)])
         )
-        return cls(
-            estimate.names[index], float(own[index]), series[k].label, torques[k], limits[k], series[k].unit
-        )
+        name, deviations = ("", np.inf) if index is None else (estimate.names[index], float(own[index]))
+        return cls(name, deviations, series[k].label, torques[k], limits[k], series[k].unit)
 
     @property
     def matters(self) -> bool:
@@ -323,10 +336,8 @@ class _Moved(NamedTuple):
         return self.deviations > _HALF_WIDTH and self.torque > self.limit
 
     def __str__(self) -> str:
-        return (
-            f"{self.name} by {self.deviations:.2f} of its standard deviations, the torque of {self.label} by "
-            f"{self.torque:.2g} {self.unit} ({self.limit:.2g} matters)"
-        )
+        parameter = f"{self.name} by {self.deviations:.2f} of its standard deviations, " if self.name else ""
+        return f"{parameter}the torque of {self.label} by {self.torque:.2g} {self.unit} ({self.limit:.2g} matters)"
 
 
 def _reweighted(

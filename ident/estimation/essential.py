@@ -19,7 +19,7 @@ from fri.errors import ConfigurationError
 from fri.quantities import Name, within
 from ident.dynamics.tables import Tabular
 from ident.estimators.covariance import CovarianceSettings
-from ident.estimators.estimate import Estimate, fisher_limit
+from ident.estimators.estimate import Estimate, fisher_limit, percent
 from ident.estimators.least_squares import WeightedLeastSquares
 from ident.estimators.problem import Problem
 from lwr_driver.listing import Listing, Piece, text_of
@@ -103,7 +103,7 @@ class Essential(Tabular):
             (
                 e.name,
                 f"{e.estimate:.4g}",
-                f"{min(e.rsd_percent, 99999.0):.1f}",
+                percent(e.rsd_percent, ".1f"),
                 f"{e.f_statistic:.2f}",
                 f"{e.loss_percent:.3f}",
                 e.reason,

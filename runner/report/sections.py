@@ -8,6 +8,7 @@ from html import escape
 from typing import Any
 
 from ident.diagnosis.outcome.statements import Number
+from ident.estimation.assumptions import HARMLESS, IN_WORDS
 from ident.estimators.problem import condition_text
 from runner.published import SOURCE, TABLE_2
 from runner.report import tables
@@ -312,6 +313,8 @@ def assumption_section(results: ResultFolder) -> str:
         table(("assumption", "verdict", "finding", "p"), rows, "Assumptions of the estimate"),
         paragraph(f"Standard deviations: {results.summary['covariance']}. {covered}", "soft"),
     ]
+    if any(check["verdict"] == HARMLESS for check in checks.values()):
+        parts.append(paragraph(f"{IN_WORDS[0].upper()}{IN_WORDS[1:]}.", "soft"))
     if checks.get("lack of fit", {}).get("verdict") == "VIOLATED":
         parts.append(
             paragraph(

@@ -13,6 +13,7 @@ import numpy as np
 
 from ident.diagnosis.outcome.claims_in_words import capital
 from ident.diagnosis.outcome.statements import in_short
+from ident.estimation.assumptions import HARMLESS
 from ident.estimators.estimate import two_digits
 from ident.model import DynamicModel
 from runner.report.folder import Curves, ResultFolder
@@ -256,12 +257,17 @@ def _assumptions(results: ResultFolder) -> Verdict | None:
     if not checks:
         return None
     violated = [name for name, check in checks.items() if check["verdict"] == "VIOLATED"]
-    held = sum(check["verdict"] == "holds" for check in checks.values())
-    text = f"{held} of {len(checks)} hold" + (f"; violated: {_listed(violated)}" if violated else "")
+    held, departed = (
+        sum(check["verdict"] == word for check in checks.values()) for word in ("holds", HARMLESS)
+    )
+    hold = f"{held} of {len(checks)} hold" + (
+        f"; {departed} departed from without consequence" if departed else ""
+    )
+    text = hold + (f"; violated: {_listed(violated)}" if violated else "")
     if violated and not str(results.summary.get("covariance", "")).startswith("textbook"):
         covered = [name for name in violated if name in _COVERED]
         open_ones = [name for name in violated if name not in _COVERED]
-        text = f"{held} of {len(checks)} hold"
+        text = hold
         text += f"; covered by the deviations: {_listed(covered)}" if covered else ""
         text += f"; not covered: {_listed(open_ones)}" if open_ones else ""
         violated = open_ones

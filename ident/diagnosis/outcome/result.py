@@ -123,13 +123,21 @@ class Finding:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """An unnamed remainder in the rows of a joint (from 1) and side."""
+    """An unnamed remainder in the rows of a joint (from 1) and side.
+
+    test_rms : error on held-out rows [Nm]. noise_floor : of these rows, or what the healthy arm may leave there [Nm].
+    """
 
     side: str
     joint: int
     depends_on: tuple[str, ...]
     test_rms: float
     noise_floor: float
+
+    @property
+    def beyond_noise(self) -> bool:
+        """Whether the error is beyond the noise; a remainder of the fit within it is none that a user meets."""
+        return not self.test_rms <= self.noise_floor
 
 
 @dataclass(frozen=True, eq=False)

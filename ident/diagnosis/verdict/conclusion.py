@@ -103,10 +103,13 @@ def conclude(task: Task, state: State) -> Diagnosis:
     fitted = {(term.side, term.joint) for term in told.nameless}
     extended_rms = told.after.rms()
     left = [
-        (r.side, r.joint, r.depends_on)
+        Unexplained(
+            r.side, r.joint, r.depends_on, *_error_and_noise(extended_rms, evidence.floor, r.side, r.joint)
+        )
         for r in remainders
         if (r.side, r.joint) not in fitted and r.inflation > FELT_POWER
     ]
+    left = [one for one in left if one.beyond_noise]
     left += _beyond_healthy(task, told.before.rms(), extended_rms, evidence.floor, findings, told.added, left)
     replayed = list(task.test) or list(task.sessions)
     simulation = extended_simulation = None
@@ -127,11 +130,12 @@ def conclude(task: Task, state: State) -> Diagnosis:
         doubted=tuple(doubts),
         nameless=told.nameless,
         extension=told.added,
-        unexplained=tuple(
-            Unexplained(
-                side, j, variables, float(extended_rms[side][j - 1]), float(evidence.floor[side][j - 1])
-            )
-            for side, j, variables in (*_stuck(nominal), *left)
+        unexplained=(
+            *(
+                Unexplained(side, j, variables, *_error_and_noise(extended_rms, evidence.floor, side, j))
+                for side, j, variables in _stuck(nominal)
+            ),
+            *left,
         ),
         noise_floor=evidence.floor,
         rms_base=told.before.rms(),
@@ -290,9 +294,10 @@ def _beyond_healthy(
     noise: Mapping[str, Floats],
     findings: Sequence[Finding],
     added: Sequence[str],
-    known: Sequence[tuple[str, int, tuple[str, ...]]],
-) -> list[tuple[str, int, tuple[str, ...]]]:
-    """Side and joint (from 1) of torques with an error far beyond that of the healthy days, of no known variable.
+    known: Sequence[Unexplained],
+) -> list[Unexplained]:
+    """Torques with an error far beyond that of the healthy days, of no known variable. Their noise floor is at most
+    what healthy days may leave.
 
     before, after : errors of base and extended model. Less than the extension takes off an error is that of its laws. A
     finding that the extension, `added`, does not hold explains the error of its joints. noise : of these rows; without
@@ -304,17 +309,29 @@ def _beyond_healthy(
     if () in open_:
         return []
     explained = {joint for joints in open_ for joint in joints}
-    told = {(side, joint) for side, joint, _ in known}
-    found: list[tuple[str, int, tuple[str, ...]]] = []
+    told = {(one.side, one.joint) for one in known}
+    found: list[Unexplained] = []
     for side, usual in healthy.items():
         if side not in after:
             continue
         least, most = BEYOND_HEALTHY
-        far = after[side] > np.clip(noise[side], least * usual, most * usual)
+        limit = np.clip(noise[side], least * usual, most * usual)
+        far = after[side] > limit
         far &= after[side] ** 2 - usual**2 > before[side] ** 2 - after[side] ** 2
         joints = (np.flatnonzero(far) + 1).tolist()
-        found += [(side, j, ()) for j in joints if j not in explained and (side, j) not in told]
+        found += [
+            Unexplained(side, j, (), float(after[side][j - 1]), float(limit[j - 1]))
+            for j in joints
+            if j not in explained and (side, j) not in told
+        ]
     return found
+
+
+def _error_and_noise(
+    rms: Mapping[str, Floats], floor: Mapping[str, Floats], side: str, joint: int
+) -> tuple[float, float]:
+    """Error on held-out rows and noise floor [Nm] of a joint (from 1)."""
+    return float(rms[side][joint - 1]), float(floor[side][joint - 1])
 
 
 def _channel_notes(nominal: Nominal, remainders: Sequence[Remainder]) -> list[str]:

@@ -7,7 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ident.estimation.assumptions import check_assumptions, repeatability, weak_parameters
+from ident.estimation.assumptions import (
+    Assumptions,
+    Check,
+    check_assumptions,
+    repeatability,
+    weak_parameters,
+)
 from ident.estimators import InstrumentalVariables, Problem, RowGroup, WeightedLeastSquares
 from ident.estimators.covariance import CovarianceSettings
 from tests.ident.regression_problems import ar1, design, problem
@@ -149,6 +155,26 @@ def test_the_verdict_table_names_every_check_and_what_follows():
     assert "VIOLATED" in text
     assert "state a robust covariance" in text
     assert found.to_dict()["serially uncorrelated"]["verdict"] == "VIOLATED"
+
+
+def test_a_departure_without_consequence_does_not_hold_but_is_harmless():
+    small = Check("normality", True, "p 6.5e-10", "outliers", 40.0, 6.5e-10)
+    assert (small.verdict, replace(small, p_value=0.2).verdict) == ("harmless", "holds")
+    assert replace(small, holds=False).verdict == "VIOLATED"
+    assert Check("condition number", True, "12", "").verdict == "holds"
+    assert "beyond chance" not in Assumptions((replace(small, p_value=0.2),)).summary()
+    assert "harmless: a departure beyond chance" in Assumptions((small,)).summary()
+
+
+def test_with_a_prior_the_torque_alone_tells_the_consequence():
+    matrices = design(samples=300)
+    random = np.random.default_rng(0)
+    case = problem(matrices, CHI, [ar1(random, 300, 0.0) for _ in matrices])
+    plain = WeightedLeastSquares().fit(case)
+    assert "of its standard deviations" in check_assumptions(case, plain)["normality"].finding
+    found = check_assumptions(case, replace(plain, prior_scale=1.0))["normality"]
+    assert "of its standard deviations" not in found.finding
+    assert found.holds
 
 
 def nearly_alike(samples: int, apart: float) -> Problem:

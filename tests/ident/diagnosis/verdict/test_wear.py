@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from ident.diagnosis import Diagnosis, Reference, commission, diagnose
 from ident.diagnosis.healthy.day_spread import habit
 from ident.diagnosis.healthy.reference import INERTIA_BY_PHASE
+from ident.diagnosis.outcome.result import Unexplained
 from ident.dynamics.kinematics import Chain
 from lwr_driver.session import Session
 from tests.ident.diagnosis.changes import Make, Signals, pair
@@ -114,9 +115,20 @@ def test_an_error_far_beyond_that_of_the_healthy_days_is_unexplained_though_no_v
     found = diagnose(pair(make, seed=31), chain, reference=replace(reference, left=calm))
     assert not found.findings
     assert [(u.side, u.joint, u.depends_on) for u in found.unexplained] == [("motor", 2, ())]
+    assert all(
+        u.test_rms > u.noise_floor for u in found.unexplained
+    )  # the limit is what the error is held against
     assert "far beyond that of the healthy days" in str(found)
     assert "no single variable" in str(found)
     assert not diagnose(pair(make, seed=31), chain, reference=reference).unexplained
+
+
+def test_an_error_within_the_noise_is_not_unexplained() -> None:
+    assert not Unexplained("motor", 2, ("speed",), 0.3, 0.31).beyond_noise
+    assert Unexplained("motor", 2, ("speed",), 0.32, 0.31).beyond_noise
+    assert Unexplained(
+        "motor", 2, ("speed",), float("nan"), 0.31
+    ).beyond_noise  # no held-out row tells otherwise
 
 
 def test_wear_is_no_part_of_the_extension(of_worn_arm: Diagnosis) -> None:
