@@ -72,6 +72,11 @@ def unit(name: str, *, prismatic: bool = False) -> str:
     return units["o" if kind == "O" else kind]
 
 
+def printed_unit(unit: str) -> str:
+    """A unit as it is printed: kg m², Nm/rad³."""
+    return unit.replace("^2", "²").replace("^3", "³")
+
+
 def joint_unit(unit: str, *, prismatic: bool) -> str:
     """A unit such as `Nm`, `rad` or `rad/Nm`, for a `prismatic` joint in N and m."""
     return unit.replace("Nm", "N").replace("rad", "m") if prismatic else unit

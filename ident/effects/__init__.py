@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from fri.errors import ConfigurationError
-from ident.dynamics.parameters import joint_unit
 from ident.dynamics.structure import Side
 from ident.effects import channel, drive, friction, link, load, nameless
 from ident.effects.effect import (
@@ -191,7 +190,7 @@ def entry_of(
 ) -> dict[str, Any]:
     """An entry of a model's effects. joints : from 1. values : value and standard deviation by parameter.
     prismatic : whether the joint slides."""
-    units = {p.name: joint_unit(p.unit, prismatic=prismatic) for p in effect.parameters}
+    units = effect.units(form, prismatic=prismatic)
     return {
         "cause": effect.cause,
         "side": effect.side,

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
+from ident.dynamics.parameters import joint_unit
 from ident.effects.motion import ArmMotion, Floats
 from ident.effects.words import Values, quantity, spoken
 
@@ -541,6 +542,10 @@ class Effect(ABC):
 
     def sense_motor(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:  # noqa: B027
         """Change the motor torque as reported by a simulated arm."""
+
+    def units(self, form: Form | str | None = None, *, prismatic: bool = False) -> dict[str, str]:
+        """Unit by parameter, for an effect of that form. prismatic : whether the joint slides."""
+        return {p.name: joint_unit(p.unit, prismatic=prismatic) for p in self.parameters}
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:
         """Phrases with a finding's parameters. names : of the joints. KeyError for a missing value."""

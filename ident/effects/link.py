@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ident.dynamics.parameters import joint_unit
 from ident.effects.effect import (
     Column,
     Discriminator,
@@ -27,7 +28,7 @@ from ident.effects.effect import (
 )
 from ident.effects.motion import ArmMotion, Floats, dahl
 from ident.effects.springs import Springs
-from ident.effects.words import MODELS, Values, one_joint, quantity, quantity_text, times, wave
+from ident.effects.words import MODELS, Values, one_joint, quantity, times, wave
 from ident.rows.filters import differentiate, low_pass, settling
 
 # Cut-off of a twist before it is differentiated, with the link and with the motor displaced [Hz].
@@ -310,6 +311,12 @@ class CableSpring(Effect):
     experiment = Discriminator.SLOW_SWEEP
     tell_apart = "the same slow sweep of joint {joint} in two postures of the other joints"
 
+    def units(self, form: Form | str | None = None, *, prismatic: bool = False) -> dict[str, str]:
+        """A cubic spring's stiffness is its torque over the cube of the angle."""
+        cubic = (form.value if isinstance(form, Form) else form) == _Spring.CUBIC.value
+        stiffness = joint_unit("Nm/rad^3" if cubic else "Nm/rad", prismatic=prismatic)
+        return super().units(form, prismatic=prismatic) | {"stiffness": stiffness}
+
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
         """Linear, cubic, hardening and one-sided springs, springs with play, and hoses on to the next two joints."""
         low, high = setting.position_range[joint]
@@ -387,7 +394,7 @@ class CableSpring(Effect):
         """Stiffness, and the curve of the pull."""
         stiffness = quantity(values["stiffness"])
         if form is _Spring.CUBIC:
-            return [f"grows with the cube of the angle, {quantity_text(*values['stiffness'][:2], 'Nm/rad³')}"]
+            return [f"grows with the cube of the angle, {stiffness}"]
         if form is _Spring.HARDENING:
             terms = [name for name in ("quadratic", "cubic") if name in values]
             bent = ", ".join(f"{name} {quantity(values[name])}" for name in terms)

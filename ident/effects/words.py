@@ -6,6 +6,8 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
+from ident.dynamics.parameters import printed_unit
+
 Triple = tuple[float, float, str]
 Values = Mapping[str, Triple]
 """Value, standard deviation and unit by name."""
@@ -15,7 +17,7 @@ MODELS = "the model's"
 
 def quantity_text(value: float, std: float, unit: str) -> str:
     """A value with its standard deviation to two digits, and no more digits of the value."""
-    unit = "" if unit == "1" else f" {unit.replace('^2', '²')}"
+    unit = "" if unit == "1" else f" {printed_unit(unit)}"
     if not (std > 0.0 and math.isfinite(std)):
         return f"{value:.4g}{unit}"
     places = max(0, 1 - math.floor(math.log10(std)))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from fri.errors import ConfigurationError, DataError
+from ident.dynamics.parameters import printed_unit
 from ident.effects import described, find_effect, summary_of
 from ident.effects.words import joints_text, quantity_text, spoken
 from lwr_driver.listing import Listing, Piece, text_of
@@ -61,7 +62,7 @@ class Revelation:
     def truth(self) -> str:
         """The effect in words."""
         effect = self.effect
-        units = {p.name: p.unit for p in find_effect(effect.cause).parameters}
+        units = find_effect(effect.cause).units(effect.form)
         values = {name: (value, 0.0, units[name]) for name, value in effect.parameters.items()}
         size = described(effect.cause, values, effect.form, self.joint_names)
         return f"{_title(effect.cause, effect.joints, self.joint_names)}: {summary_of(effect.cause)}; {size}"
@@ -102,7 +103,7 @@ class Revelation:
         """Parameter, truth, value found, and its error in standard deviations, as text."""
         found = []
         for row in self.parameters:
-            name = spoken(row.name) + ("" if row.unit in ("", "1") else f" [{row.unit}]")
+            name = spoken(row.name) + ("" if row.unit in ("", "1") else f" [{printed_unit(row.unit)}]")
             truth = "-" if row.truth is None else f"{row.truth:.4g}"
             value = "-" if row.found is None else quantity_text(row.found, row.std or 0.0, "1")
             found.append((name, truth, value, "" if row.sigmas is None else f"{row.sigmas:+.1f}"))
@@ -205,7 +206,7 @@ def _outcome(
 
 def _rows(effect: HiddenEffect, finding: Mapping[str, Any]) -> tuple[Compared, ...]:
     values = finding.get("parameters") or {}
-    units = {p.name: p.unit for p in find_effect(effect.cause).parameters}
+    units = find_effect(effect.cause).units(effect.form)
     rows = []
     for name in (*effect.parameters, *(name for name in values if name not in effect.parameters)):
         one = values.get(name)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from ident.dynamics.parameters import PER_LINK
+from ident.dynamics.parameters import PER_LINK, printed_unit
 from runner.published import TABLE_2
 from runner.report.figure import Figure, MatrixFigure
 from runner.report.folder import Curves, ResultFolder
@@ -236,8 +236,8 @@ def every_figure(results: Results, *, joints: str = "numbers") -> list[Figure | 
 
 
 def pretty_unit(unit: str) -> str:
-    """A unit as it is printed: kg m², Nm s/rad."""
-    return unit.replace("^2", "²").replace(" ", "\N{NO-BREAK SPACE}")
+    """A unit as it is printed, in one line: kg m², Nm s/rad."""
+    return printed_unit(unit).replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def interval_95(entry: dict[str, float]) -> tuple[float, float]:

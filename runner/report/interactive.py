@@ -108,13 +108,17 @@ def panel_chart(panel: Panel) -> dict[str, Any]:
             "anchor": "y2" if panel.split else "y",
             **({"showspikes": False} if panel.x_names else {}),
         },
-        "yaxis": {**_axis(panel.y_label), "domain": [_SPLIT + 0.05, 1.0] if panel.split else [0.0, 1.0]},
+        # Five digits are wider than the margin, and the label would lie over them.
+        "yaxis": {
+            **_axis(panel.y_label),
+            "automargin": True,
+            "domain": [_SPLIT + 0.05, 1.0] if panel.split else [0.0, 1.0],
+        },
     }
     if panel.x_names:
         places = list(range(1, len(panel.x_names) + 1))
         layout["xaxis"] |= {"tickvals": places, "ticktext": list(panel.x_names)}
         layout["xaxis"] |= {"automargin": True, "autotickangles": [0, -90]}
-        layout["yaxis"]["automargin"] = True
     if panel.split:
         # The x axis belongs to the lower part, so the frame of the upper one is drawn.
         box = {"x0": 0, "x1": 1, "y0": _SPLIT + 0.05, "y1": 1}

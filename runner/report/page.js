@@ -57,7 +57,38 @@
   stack();
   window.addEventListener("resize", stack);
 
-  for (const part of document.querySelectorAll("details")) {
+  // On a narrow screen each long part is folded behind its heading; a link, a print or a wide screen opens it.
+  const narrow = window.matchMedia("(max-width: 640px)");
+  const foldable = () => {
+    const long = [...document.querySelectorAll("main > section")].filter((one) => one.offsetHeight > window.innerHeight);
+    for (const one of long) {
+      if (one.querySelector(":scope > details.part")) continue;
+      const part = document.createElement("details"), head = document.createElement("summary");
+      part.className = "part";
+      head.append(one.querySelector("h2"));
+      part.append(head, ...one.childNodes);
+      one.append(part);
+      part.addEventListener("toggle", () => { stack(); part.querySelectorAll(".chart").forEach(draw); });
+    }
+  };
+  const unfold = (inside) => { for (const part of inside.querySelectorAll("details.part")) part.open = true; };
+  const target = () => {
+    const one = location.hash && document.getElementById(decodeURIComponent(location.hash.slice(1)));
+    if (!one) return;
+    unfold(one);
+    one.closest("details.part")?.setAttribute("open", "");
+    one.scrollIntoView();
+  };
+  if (narrow.matches) foldable();
+  narrow.addEventListener("change", () => { if (narrow.matches) foldable(); else unfold(document); });
+  window.addEventListener("hashchange", target);
+  document.addEventListener("click", (event) => {
+    const link = event.target.closest?.("a[href^='#']");
+    if (link && link.hash === location.hash) target();
+  });
+  target();
+
+  for (const part of document.querySelectorAll("details:not(.part)")) {
     part.addEventListener("toggle", () => { stack(); part.querySelectorAll(".chart").forEach(draw); });
   }
   const fit = (width) => {
@@ -68,7 +99,7 @@
         : { autosize: false, width: square ? 640 : width, height: square ? 640 : chart.clientHeight });
     }
   };
-  window.addEventListener("beforeprint", () => { charts.forEach(draw); fit(340); });
+  window.addEventListener("beforeprint", () => { unfold(document); charts.forEach(draw); fit(340); });
   window.addEventListener("afterprint", () => { fit(null); stack(); });
 
   const begin = async () => {

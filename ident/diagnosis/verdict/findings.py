@@ -18,7 +18,6 @@ from ident.diagnosis.healthy.reference import DELAY_STD_S
 from ident.diagnosis.outcome.result import Finding, FindingEvidence, Value
 from ident.diagnosis.rows.recording import SessionRecord, sensor_limits
 from ident.diagnosis.verdict.task import State, Task
-from ident.dynamics.parameters import joint_unit
 from ident.effects import EFFECTS, LOST_SAMPLES, SENSOR_SATURATION
 from ident.rows.data_quality import SampleLoss
 
@@ -87,8 +86,9 @@ def _parameters(trial: Trial, bench: DiagnosisBench) -> dict[str, Value]:
         scale = effect.linear[0].name
         deviations[scale] = float(np.hypot(deviations[scale], change))
     slides = not effect.whole_arm and bool(bench.nominal.arm.chain.prismatic[trial.candidate.joint])
+    units = effect.units(trial.shape.form, prismatic=slides)
     return {
-        p.name: Value(values[p.name], deviations[p.name], joint_unit(p.unit, prismatic=slides))
+        p.name: Value(values[p.name], deviations[p.name], units[p.name])
         for p in effect.parameters
         if p.name in values and p.name not in effect.hidden
     }

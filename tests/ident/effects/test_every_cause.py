@@ -26,9 +26,11 @@ from ident.effects import (
     Shape,
     check_entry,
     described,
+    entry_of,
     find_effect,
     parameter_values,
 )
+from ident.effects.words import quantity_text
 from tests.ident.effects.swing import COULOMB, VISCOUS, swing
 
 URDF = Path(__file__).parents[3] / "configs" / "lwr4plus.urdf"
@@ -278,6 +280,16 @@ def test_a_shape_is_a_mapping_with_a_form() -> None:
         EFFECTS["stribeck"].shape_of({"velocity": 0.1}, "steep")
 
 
+def test_a_cubic_spring_has_a_stiffness_of_its_own_unit() -> None:
+    spring = EFFECTS["cable_spring"]
+    assert spring.units("cubic")["stiffness"] == "Nm/rad^3"
+    assert spring.units("hardening")["stiffness"] == spring.units()["stiffness"] == "Nm/rad"
+    assert spring.units("cubic", prismatic=True)["stiffness"] == "N/m^3"
+    entry = entry_of(spring, [2], {"stiffness": (1.0, 0.1)}, "cubic")
+    assert entry["parameters"]["stiffness"]["unit"] == "Nm/rad^3"
+    assert quantity_text(1.0, 0.1, "Nm/rad^3") == "1.0 ± 0.1 Nm/rad³"
+
+
 def test_delays_are_found_by_their_channel() -> None:
     assert {side: effect.channel for side, effect in DELAYS.items()} == {"motor": "motor", "joint": "joint"}
 
@@ -319,7 +331,7 @@ def test_delays_are_found_by_their_channel() -> None:
 def test_parameters_are_put_into_words(
     cause: str, form: str | None, values: dict[str, float], said: str
 ) -> None:
-    units = {p.name: p.unit for p in EFFECTS[cause].parameters}
+    units = EFFECTS[cause].units(form)
     given = {name: (float(value), 0.01, units[name]) for name, value in values.items()}
     assert said in described(cause, given, form, NAMES)
 

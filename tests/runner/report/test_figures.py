@@ -23,6 +23,7 @@ from ident.diagnosis.outcome.statements import Number, Part
 from ident.estimators.estimate import percent
 from runner.report.diagnosis import _part
 from runner.report.figure import Figure, MatrixFigure, inline_svg
+from runner.report.figures import pretty_unit
 from runner.report.interactive import chart_json, lighter_charts, panel_chart, zipped
 from runner.report.latex import tabular
 from runner.report.markup import (
@@ -218,6 +219,17 @@ def test_matplotlib_is_imported_only_to_draw() -> None:
 
 def unpacked(column: dict[str, object]) -> np.ndarray:
     return column["low"] + column["step"] * np.cumsum(column["moves"])  # type: ignore[operator]
+
+
+def test_labels_leave_room_for_long_numbers_of_their_axis() -> None:
+    x = np.linspace(0.0, 1.0, 5)
+    layout = panel_chart(panel(marks=(Line("measured", "m", x, -0.05 * x),)))["layout"]
+    assert layout["yaxis"]["automargin"] is True
+
+
+@pytest.mark.parametrize(("unit", "printed"), [("Nm/rad^3", "Nm/rad³"), ("kg m^2", "kg\N{NO-BREAK SPACE}m²")])
+def test_powers_of_units_are_raised(unit: str, printed: str) -> None:
+    assert pretty_unit(unit) == printed
 
 
 def test_the_page_has_the_lines_to_a_ten_thousandth_of_their_range() -> None:

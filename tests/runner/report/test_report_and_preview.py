@@ -370,6 +370,27 @@ def test_no_column_of_a_table_is_cut_off(finished: Path, chrome: Browser, size: 
         assert seen.page.evaluate(cut) == []
 
 
+def test_a_narrow_page_folds_its_long_parts_and_links_open_them(finished: Path, chrome: Browser) -> None:
+    with opened(chrome, finished / "report.html", NARROW) as seen:
+        page = seen.page
+        seen.wait_drawn()
+        assert page.evaluate("document.documentElement.scrollHeight") < 5 * NARROW[1]
+        for anchor in ("torque", "parameters"):
+            part = page.locator(f"#{anchor} > details.part")
+            assert not part.evaluate("part => part.open")
+            page.locator(f"nav a[href='#{anchor}']").click()
+            page.wait_for_function(f"document.querySelector('#{anchor} > details.part').open")
+        drawn = "document.querySelector('#torque .chart').dataset.drawn === 'yes'"
+        page.wait_for_function(drawn, timeout=120_000)
+        page.set_viewport_size({"width": WIDE[0], "height": WIDE[1]})
+        page.wait_for_function("[...document.querySelectorAll('details.part')].every(part => part.open)")
+        assert seen.errors == []
+
+
+def test_a_wide_page_folds_none_of_its_parts(report: Seen) -> None:
+    assert report.page.locator("details.part").count() == 0
+
+
 def test_plots_are_drawn_without_scrolling(finished: Path, chrome: Browser) -> None:
     blank = "[...document.querySelectorAll('.chart:not([data-drawn])')].filter(c => !c.closest('details:not([open])'))"
     with opened(chrome, finished / "report.html", WIDE) as seen:
