@@ -179,8 +179,8 @@ class Replay:
             )
         if self._stood_in:
             found.append(
-                f"replay of {', '.join(self._stood_in)}: the estimated inertias are physically impossible, so the "
-                "nearest possible arm was simulated; a more exciting motion would improve the estimate"
+                f"replay of {', '.join(self._stood_in)}: no real bodies have the parameters of the simulated model, so "
+                "the nearest real ones were simulated; a more exciting motion would improve the estimate"
             )
         return tuple(found)
 

@@ -31,7 +31,7 @@ _GROUPS = {
     help="Held-out session, never fitted (repeatable).",
 )
 @click.option("--model", type=PATH, help="Present model, the baseline of the simulation.")
-@click.option("--reference", type=PATH, help="Model of `lwr-run commission`, arm healthy.")
+@click.option("--reference", type=PATH, help="Healthy-arm baseline of `lwr-run commission`.")
 @click.option("--out", required=True, type=OUTPUT_FOLDER, help="Folder of the results.")
 @arm_options
 @click.option(

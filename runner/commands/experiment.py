@@ -88,7 +88,7 @@ def command(
     opens the report; report.txt and --verbose have the tables.
 
     Without FILE it takes the experiment.yaml of `lwr-run init` in this folder, else the default experiment. A real arm
-    is moved by a FILE that you name alone.
+    moves only if you name its FILE.
 
     Ctrl-C once stops the arm within its limits, twice drops the link.
 

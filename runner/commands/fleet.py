@@ -71,8 +71,9 @@ def batch_command(
     """Identify and diagnose every arm's every day in the logs below each FOLDER.
 
     The arm is robot and serial number of a log, or the folder it lies in; the day a date in its path, such as
-    2026-03-12, or the log's own. What the store holds is not done again: add a day's folder and repeat the command.
-    Copies are known by the identity of the log. An unreadable log or a failed day is noted and stops nothing.
+    2026-03-12, or the log's own, else `undated`. What the store holds is not done again: add a day's folder and repeat
+    the command. Copies are known by the identity of the log. An unreadable log or a failed day is noted and stops
+    nothing.
 
     \b
     lwr-run batch logs/ --store fleet --jobs -1
@@ -151,6 +152,7 @@ def trend_command(arm: str | None, store: Path, out: Path | None, as_json: bool)
 
     A change is a step or a drift of a parameter, or of the error of a torque, beyond the scatter from day to day; one
     arm in a thousand has one by chance. Of five arms or more, those unlike the others are named.
+    With fewer than five days no change can be told.
 
     \b
     lwr-run trend --store fleet

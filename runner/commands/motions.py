@@ -33,8 +33,8 @@ def plan_command(file: str, out: Path | None, as_json: bool) -> None:
     The plan file has coefficients, margins of all limits on the continuous motion, objective values, predicted
     relative standard deviations, seeds and versions. An experiment uses it through `excitation: {plan: FILE}`.
     Ctrl-C ends the search and keeps the best motion so far that is within every limit; before the first one, which may
-    take a minute, there is none to keep. At last a bound that no motion within the limits can fall below tells how far
-    from the best this one may be.
+    take a minute, there is none to keep. At the end a lower bound tells how far from the best possible motion this one
+    may be.
 
     \b
     lwr-run plan

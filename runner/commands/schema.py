@@ -20,7 +20,7 @@ from runner.terminal import PATH, json_option, tell, verb
     "files",
     multiple=True,
     type=PATH,
-    help="Let this YAML file refer to its schema, so that an editor finds it; may be repeated.",
+    help="Let this YAML file refer to its schema, so that an editor finds it (repeatable).",
 )
 @json_option
 def command(name: str | None, out: Path | None, files: tuple[Path, ...], as_json: bool) -> None:

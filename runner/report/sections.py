@@ -39,6 +39,10 @@ _SLOWEST_S = 2e-3
 _WORDS: dict[bool | None, str] = {True: "yes", False: "no", None: "–"}
 
 
+_OF_LOGS = 5
+"""Columns of the sessions without those of a link."""
+
+
 def session_section(results: ResultFolder) -> str:
     """Sessions with their link, and the conditions checked before each motion."""
     links = results.summary.get("link", {})
@@ -65,11 +69,14 @@ def session_section(results: ResultFolder) -> str:
                 Number(1000 * max(link["worst_tracking_error_rad"]) if link else None, ".1f"),
             ]
         )
-    head = (
+    head: tuple[str, ...] = (
         "session", "for", "ended", "payload", "lasted [s]", "cycles", "missed", "lost", "late", "reply 50 % [µs]",
         "99 % [µs]", "worst [µs]", "tracking [mrad]",
     )  # fmt: skip
-    parts = [table(head, rows, "Sessions and their link")]
+    label = "Sessions and their link"
+    if not links:  # logs of another program
+        head, rows, label = head[:_OF_LOGS], [row[:_OF_LOGS] for row in rows], "Sessions"
+    parts = [table(head, rows, label)]
     if results.lock_step:
         text = "Lock step: the emulator waited for every reply, so the reply times are not those of a link."
         parts.append(paragraph(text, "soft"))

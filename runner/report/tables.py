@@ -92,8 +92,9 @@ def better_than_published(results: ResultFolder) -> str:
         (better if all(value < getattr(rebuilt(one), key) for one in REBUILT) else worse).append(text)
     made = f", made for {_OBJECTIVES[objective]}," if objective in _OBJECTIVES else ""
     parts = [f"Beside the three rebuilt motions the plan of this run{made} is"]
-    parts.append(f"better in {' and '.join(better)}" if better else "better in nothing")
-    return " ".join(parts) + (f", and not the best in {' and '.join(worse)}." if worse else ".")
+    said = [f"better in {' and '.join(better)}"] if better else []
+    said += [f"not the best in {' and '.join(worse)}"] if worse else []
+    return f"{' '.join(parts)} {', and '.join(said)}."
 
 
 def estimate_rsd(results: ResultFolder) -> str:

@@ -12,10 +12,11 @@ from typing import Any, Literal
 import numpy as np
 
 from ident.diagnosis.outcome.claims_in_words import capital
-from ident.diagnosis.outcome.statements import in_short
+from ident.diagnosis.outcome.statements import NOTHING, in_short
 from ident.estimation.assumptions import HARMLESS
 from ident.estimators.estimate import two_digits
 from ident.model import DynamicModel
+from runner.report.diagnosis import DiagnosisFolder
 from runner.report.folder import Curves, ResultFolder
 
 Level = Literal["good", "look", "bad"]
@@ -257,12 +258,11 @@ def _assumptions(results: ResultFolder) -> Verdict | None:
     if not checks:
         return None
     violated = [name for name, check in checks.items() if check["verdict"] == "VIOLATED"]
-    held, departed = (
-        sum(check["verdict"] == word for check in checks.values()) for word in ("holds", HARMLESS)
-    )
-    hold = f"{held} of {len(checks)} hold" + (
-        f"; {departed} departed from without consequence" if departed else ""
-    )
+    words = ("holds", HARMLESS, "not tested")
+    held, departed, untested = (sum(check["verdict"] == word for check in checks.values()) for word in words)
+    hold = f"{held} of {len(checks)} hold"
+    hold += f", {departed} with harmless departures" if departed else ""
+    hold += f", {untested} not tested" if untested else ""
     text = hold + (f"; violated: {_listed(violated)}" if violated else "")
     if violated and not str(results.summary.get("covariance", "")).startswith("textbook"):
         covered = [name for name in violated if name in _COVERED]
@@ -276,7 +276,7 @@ def _assumptions(results: ResultFolder) -> Verdict | None:
 
 def _real_bodies(results: ResultFolder) -> Verdict | None:
     real = results.summary.get("feasibility")
-    if not real or not real["possible"]:  # what is beyond chance is a warning
+    if not real or real["real"] or not real["possible"]:  # what is beyond chance is a warning
         return None
     return Verdict("real bodies", real["text"], "", "good", "parameters")
 
@@ -360,6 +360,11 @@ def _diagnosis(results: ResultFolder) -> Verdict | None:
     if diagnosis is None:
         return None
     level, text = in_short(diagnosis, results.joint_names)
+    if text.startswith(NOTHING):
+        # What is left without a cause is a part of the answer.
+        folder = DiagnosisFolder.of(results)
+        assert folder is not None
+        level, text = folder.statements.level, folder.statements.headline + text.removeprefix(NOTHING)
     return Verdict("diagnosis", text, "", level, "diagnosis")
 
 

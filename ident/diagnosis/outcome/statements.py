@@ -229,11 +229,15 @@ def is_extended(content: Plain) -> bool:
     return any(content.get(key) for key in ("extension", "findings", "character", "nameless"))
 
 
+NOTHING = "nothing found"
+"""Beginning of a diagnosis in short without a cause."""
+
+
 def in_short(content: Plain, names: Sequence[str]) -> tuple[Level, str]:
     """The whole diagnosis in one line of a run's summary."""
     causes = [spoken(str(finding["cause"])) for finding in content.get("findings", [])]
     unexplained = len(content.get("unexplained", []))
-    text = f"found: {', '.join(dict.fromkeys(causes))}" if causes else "nothing found"
+    text = f"found: {', '.join(dict.fromkeys(causes))}" if causes else NOTHING
     character = [spoken(str(one["cause"])) for one in content.get("character", [])]
     text += f"; character of the arm: {', '.join(dict.fromkeys(character))}" if character else ""
     text += f"; terms without a name: {len(content['nameless'])}" if content.get("nameless") else ""

@@ -296,6 +296,18 @@ def test_a_diagnosis_is_shown_with_its_evidence(pages: dict[str, Path], chrome: 
     assert "found: stribeck; 1 unexplained; the extended model: A2 motor -50 %" in verdict
 
 
+def test_a_diagnosis_without_a_cause_says_in_the_first_table_what_is_left(
+    finished: Path, tmp_path: Path
+) -> None:
+    folder = copy(finished, tmp_path / "open")
+    (folder / "diagnosis.json").write_text(json.dumps(DIAGNOSIS | {"findings": []}))
+    line = next(one for one in verdicts(ResultFolder.load(folder)) if one.subject == "diagnosis")
+    assert line.level == "look"
+    assert line.found.startswith(
+        "The data support no cause, but the residuals depend on the motion; 1 unexplained"
+    )
+
+
 def test_a_run_that_failed_is_called_bad_and_still_has_a_report(finished: Path, tmp_path: Path) -> None:
     folder = copy(finished, tmp_path / "failed")
     summary = json.loads((folder / "summary.json").read_text())

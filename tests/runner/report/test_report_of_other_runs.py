@@ -74,10 +74,15 @@ def test_logs_alone_have_a_report_without_an_experiment(imported: Path, chrome: 
         subjects = seen.page.locator("table.verdicts tbody th").all_inner_texts()
         assert {"torque error (estimate)", "torque error (held-out motion)", "assumptions"} <= set(subjects)
         assert not {"link quality", "tracking error", "truth of the emulated arm"} & set(subjects)
+        seen.page.evaluate(
+            "document.querySelectorAll('details.part').forEach((part) => { part.open = true; })"
+        )
         table = seen.page.inner_text("#table-2")
         assert "no motor torques in the estimate" in table
         assert "no session without the payload" in table
-        titles = seen.page.locator("#torque details > summary").all_inner_texts()
+        head = seen.page.locator("#sessions table").first.locator("thead th").all_text_contents()
+        assert head == ["session", "for", "ended", "payload", "lasted [s]"]
+        titles = seen.page.locator("#torque details:not(.part) > summary").all_inner_texts()
         assert [title.split(":")[0] for title in titles] == [
             "check, joint torque, held out",
             "log, joint torque",

@@ -102,6 +102,19 @@ def test_two_of_a_hundred_estimates_beyond_3_sigma_are_chance_and_seven_are_not(
     assert found.level == level
 
 
+def test_departures_without_consequence_and_missing_tests_are_told_apart_from_what_holds() -> None:
+    words = {"zero mean": "holds", "normality": "harmless", "exogeneity": "not tested"}
+    found = verdict("assumptions", assumptions={name: {"verdict": word} for name, word in words.items()})
+    assert (found.level, found.found) == ("good", "1 of 3 hold, 1 with harmless departures, 1 not tested")
+
+
+@pytest.mark.parametrize(("real", "possible", "rows"), [(True, True, 0), (False, True, 1), (False, False, 0)])
+def test_bodies_that_may_be_unreal_by_chance_have_a_line(real: bool, possible: bool, rows: int) -> None:
+    content = {"feasibility": {"real": real, "possible": possible, "text": "no real bodies, p 0.3"}}
+    lines = verdicts(ResultFolder(Path("nowhere"), SUMMARY | content))
+    assert len([line for line in lines if line.subject == "real bodies"]) == rows
+
+
 def choice_of(used: str, **errors: float) -> dict[str, Any]:
     best = min(errors, key=lambda name: errors[name])
     candidates = [{"title": name, "held_back_percent": error} for name, error in errors.items()]
