@@ -11,15 +11,23 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.diagnosis.causes.probes import Remainder, find_remainders
+from ident.diagnosis.causes.selection import Claim
 from ident.diagnosis.causes.tolerances import Kind
 from ident.diagnosis.gain.held_out import BEYOND_HEALTHY, HeldOut, held_out, worse_rows
-from ident.diagnosis.gain.products import Floats
+from ident.diagnosis.gain.products import Floats, Rows
 from ident.diagnosis.healthy.bench import DiagnosisBench
-from ident.diagnosis.outcome.result import Diagnosis, Finding, Nameless, RowStates, Unexplained
+from ident.diagnosis.outcome.result import (
+    Diagnosis,
+    Finding,
+    Nameless,
+    RowStates,
+    SimulationError,
+    Unexplained,
+)
 from ident.diagnosis.outcome.torque_errors import TorqueErrors, errors_of_both
 from ident.diagnosis.rows.nominal import TRAVEL_RAD, Nominal
 from ident.diagnosis.verdict.confidence import believable
-from ident.diagnosis.verdict.confirmation import FELT_POWER, confirmed, contradicted, doubted
+from ident.diagnosis.verdict.confirmation import FELT_POWER, Confirmed, confirmed, contradicted, doubted
 from ident.diagnosis.verdict.extension import Member, extension, power_left, title, titles
 from ident.diagnosis.verdict.findings import in_order, limit_findings, loss_finding, sizeless
 from ident.diagnosis.verdict.models import changes_of, fitted_models, lasting, without_harm
@@ -36,110 +44,42 @@ log = logging.getLogger(__name__)
 
 def conclude(task: Task, state: State) -> Diagnosis:
     """The diagnosis from the claims of a selection, the timing findings and the lost samples."""
-    bench, nuisance, settings = state.bench, state.selection.nuisance_rows, task.settings
-    evidence, nominal = bench.evidence, bench.nominal
+    bench, nuisance = state.bench, state.selection.nuisance_rows
+    evidence, nominal, healthy = bench.evidence, bench.nominal, task.reference
     baseline = state.baseline if state.timing else None
     baseline = baseline or Baseline.of(bench, nuisance, lasting(state.selection))
     borne_out, refuted = confirmed(task, state)
-    kept = [one for one in borne_out if not is_level(one.claim)]
-    evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])
-    remainders = find_remainders(bench.dictionary, evidence, settings, task.limits)
-    findings = doubted(task, state, kept, remainders)
-    compared = task.reference is not None
-    believed = [believable(f.grounds) and not (compared and sizeless(f)) for f in findings]
-    doubts = [f for f, is_one in zip(findings, believed, strict=True) if not is_one]
-    if doubts:
-        # A name hardly believed is no finding; what it explained is left to the remainders.
-        kept = [one for one, is_one in zip(kept, believed, strict=True) if is_one]
-        findings = [f for f, is_one in zip(findings, believed, strict=True) if is_one]
-        evidence.replace([*(one.claim.trial.rows for one in kept), *nuisance])
-        remainders = find_remainders(bench.dictionary, evidence, settings, task.limits)
-    worn = []
-    if task.reference is not None:
-        shown = held_out(evidence, [*(one.claim.trial.rows for one in kept), *nuisance])
-        # Without the reference's prior, gains of the sensors and drive inertias compensate each other, and so do
-        # Coulomb and viscous friction and further laws, of fixed size or none in the reference's parameters.
-        free = (Kind.GAIN, Kind.SIZE, Kind.HABIT)
-        tolerated = [
-            one.tolerance.rows for one in state.selection.deviations if one.tolerance.kind not in free
-        ]
-        claimed = [one.claim.trial.rows for one in kept]
-        worn = wear(bench, task.reference, shown, claimed, tolerated, remainders)
-    members = [
-        Member((one.claim.trial.rows,), one.claim.gain, finding=finding)
-        for one, finding in zip(kept, findings, strict=True)
-        # A change between sessions has no value in a further one, and an event cannot be predicted.
-        if not one.claim.trial.passing and (nominal.held_out or not one.claim.trial.candidate.effect.event)
-    ]
-    members += [
-        Member(tuple(dict.fromkeys([(r.side, r.joint - 1)], t.column) for t in r.terms), r.gain, remainder=r)
-        for r in remainders
-        if r.terms
-    ]
-    members, after = extension(bench, baseline, members, nuisance, settings.seed)
+    claimed = _believed(task, state, borne_out)
+    worn = _worn(task, state, claimed)
+    members, after = extension(bench, baseline, _members(nominal, claimed), nuisance, task.settings.seed)
     told = _told_models(task, state, baseline, members, after)
-    findings = [*findings, *state.timing]
-    findings = [contradicted(f) if any(f is r for r in told.refuted) else f for f in findings]
-
-    def is_character(finding: Finding) -> bool:
-        return task.reference is None and EFFECTS[finding.cause].character
-
-    # What every such drive has stays character where none of the extension is in the model.
-    is_told = [believable(f.grounds) or (told.rejected and is_character(f)) for f in findings]
-    doubts += [f for f, is_one in zip(findings, is_told, strict=True) if not is_one]
-    findings = [f for f, is_one in zip(findings, is_told, strict=True) if is_one]
-    findings += [*state.loads, *worn]
-    usual = {} if task.reference is None else task.reference.lost
-    losses = [one for one in sample_loss(task.sessions) if one.beyond(usual.get(one.channel, 0.0))]
-    if losses:
-        findings.append(loss_finding(losses[0]))
-    findings += limit_findings(nominal.recordings, findings)
-    doubts = [
-        d
-        for d in (*doubts, *refuted)
-        if not any((d.cause, d.joints) == (f.cause, f.joints) for f in findings)
-    ]
-    findings = in_order(sorted(findings, key=lambda f: -f.gain), evidence.floor)
-    fitted = {(term.side, term.joint) for term in told.nameless}
-    extended_rms = told.after.rms()
-    left = [
-        Unexplained(
-            r.side, r.joint, r.depends_on, *_error_and_noise(extended_rms, evidence.floor, r.side, r.joint)
-        )
-        for r in remainders
-        if (r.side, r.joint) not in fitted and r.inflation > FELT_POWER
-    ]
-    left = [one for one in left if one.beyond_noise]
-    left += _beyond_healthy(task, told.before.rms(), extended_rms, evidence.floor, findings, told.added, left)
-    replayed = list(task.test) or list(task.sessions)
-    simulation = extended_simulation = None
-    if task.simulate is not None:
-        simulation = task.simulate(task.model or told.base, replayed)
-        changed = told.extended.effects != told.base.effects
-        extended_simulation = task.simulate(told.extended, replayed) if changed else simulation
+    findings, doubts = _findings(task, state, told, claimed, [*state.loads, *worn], refuted)
+    rms_base, rms_extended = told.before.rms(), told.after.rms()
+    left = _left(task, evidence.floor, told, findings, claimed.remainders)
+    simulation, extended_simulation = _simulated(task, told)
     return Diagnosis(
         train=tuple(r.name for r in nominal.recordings if not r.test),
         test=tuple(r.name for r in nominal.recordings if r.test),
         model_number=nominal.structure.model,
-        findings=tuple(f for f in findings if not is_character(f)),
-        character=tuple(f for f in findings if is_character(f)),
-        referenced=task.reference is not None,
+        findings=tuple(f for f in findings if not _is_character(task, f)),
+        character=tuple(f for f in findings if _is_character(task, f)),
+        referenced=healthy is not None,
         numbered=tuple(r.name for r in nominal.recordings),
-        healthy=() if task.reference is None else tuple(task.reference.model.effects),
-        healthy_left={} if task.reference is None else task.reference.left,
+        healthy=() if healthy is None else tuple(healthy.model.effects),
+        healthy_left={} if healthy is None else healthy.left,
         doubted=tuple(doubts),
         nameless=told.nameless,
         extension=told.added,
         unexplained=(
             *(
-                Unexplained(side, j, variables, *_error_and_noise(extended_rms, evidence.floor, side, j))
+                Unexplained(side, j, variables, *_error_and_noise(rms_extended, evidence.floor, side, j))
                 for side, j, variables in _stuck(nominal)
             ),
             *left,
         ),
         noise_floor=evidence.floor,
-        rms_base=told.before.rms(),
-        rms_extended=extended_rms,
+        rms_base=rms_base,
+        rms_extended=rms_extended,
         base_model=told.base,
         extended_model=told.extended,
         changes=changes_of(told.base, told.extended) if told.added else {},
@@ -148,8 +88,8 @@ def conclude(task: Task, state: State) -> Diagnosis:
         simulation_base=simulation,
         simulation_extended=extended_simulation,
         notes=(
-            *_notes(task, bench, told.before.rms()),
-            *_channel_notes(nominal, remainders),
+            *_notes(task, bench, rms_base),
+            *_channel_notes(nominal, claimed.remainders),
             *state.notes,
             *told.notes,
         ),
@@ -159,6 +99,134 @@ def conclude(task: Task, state: State) -> Diagnosis:
         torque_extended=None if told.errors is None else told.errors[1],
         torque_present=_of_present(task),
     )
+
+
+class _Claimed(NamedTuple):
+    """Claims that are believed, the finding of each, findings hardly believed, and the remainders beside the claims."""
+
+    claims: Sequence[Claim]
+    findings: Sequence[Finding]
+    doubts: Sequence[Finding]
+    remainders: tuple[Remainder, ...]
+
+    @property
+    def rows(self) -> list[Rows]:
+        """Columns of the claims."""
+        return [claim.trial.rows for claim in self.claims]
+
+
+def _believed(task: Task, state: State, borne_out: Sequence[Confirmed]) -> _Claimed:
+    """The claims that held-out rows bear out, told by the remainders beside them; they stay in the evidence."""
+
+    def remainders(some: Sequence[Confirmed]) -> tuple[Remainder, ...]:
+        evidence = state.bench.evidence
+        evidence.replace([*(one.claim.trial.rows for one in some), *state.selection.nuisance_rows])
+        return find_remainders(state.bench.dictionary, evidence, task.settings, task.limits)
+
+    kept = [one for one in borne_out if not is_level(one.claim)]
+    left = remainders(kept)
+    findings = doubted(task, state, kept, left)
+    compared = task.reference is not None
+    believed = [believable(f.grounds) and not (compared and sizeless(f)) for f in findings]
+    doubts = [f for f, is_one in zip(findings, believed, strict=True) if not is_one]
+    if doubts:
+        # A name hardly believed is no finding; what it explained is left to the remainders.
+        kept = [one for one, is_one in zip(kept, believed, strict=True) if is_one]
+        findings = [f for f, is_one in zip(findings, believed, strict=True) if is_one]
+        left = remainders(kept)
+    return _Claimed([one.claim for one in kept], findings, doubts, left)
+
+
+def _worn(task: Task, state: State, claimed: _Claimed) -> list[Finding]:
+    """Findings of changed drives; none without a healthy arm."""
+    if task.reference is None:
+        return []
+    bench, selection = state.bench, state.selection
+    shown = held_out(bench.evidence, [*claimed.rows, *selection.nuisance_rows])
+    # Without the reference's prior, gains of the sensors and drive inertias compensate each other, and so do
+    # Coulomb and viscous friction and further laws, of fixed size or none in the reference's parameters.
+    free = (Kind.GAIN, Kind.SIZE, Kind.HABIT)
+    tolerated = [one.tolerance.rows for one in selection.deviations if one.tolerance.kind not in free]
+    return wear(bench, task.reference, shown, claimed.rows, tolerated, claimed.remainders)
+
+
+def _members(nominal: Nominal, claimed: _Claimed) -> list[Member]:
+    """What may be in the extended model: the claims with a value in a further session, and terms without a name."""
+    named = [
+        Member((claim.trial.rows,), claim.gain, finding=finding)
+        for claim, finding in zip(claimed.claims, claimed.findings, strict=True)
+        # A change between sessions has no value in a further one, and an event cannot be predicted.
+        if not claim.trial.passing and (nominal.held_out or not claim.trial.candidate.effect.event)
+    ]
+    nameless = [
+        Member(tuple(dict.fromkeys([(r.side, r.joint - 1)], t.column) for t in r.terms), r.gain, remainder=r)
+        for r in claimed.remainders
+        if r.terms
+    ]
+    return [*named, *nameless]
+
+
+def _is_character(task: Task, finding: Finding) -> bool:
+    return task.reference is None and EFFECTS[finding.cause].character
+
+
+def _findings(
+    task: Task,
+    state: State,
+    told: _Told,
+    claimed: _Claimed,
+    of_parameters: Sequence[Finding],
+    refuted: Sequence[Finding],
+) -> tuple[list[Finding], list[Finding]]:
+    """All findings in their order, and the doubted ones.
+
+    of_parameters : of payloads and wear. refuted : by held-out rows.
+    """
+    evidence, nominal = state.bench.evidence, state.bench.nominal
+    named = [*claimed.findings, *state.timing]
+    named = [contradicted(f) if any(f is r for r in told.refuted) else f for f in named]
+    # What every such drive has stays character where none of the extension is in the model.
+    is_told = [believable(f.grounds) or (told.rejected and _is_character(task, f)) for f in named]
+    found = [f for f, is_one in zip(named, is_told, strict=True) if is_one]
+    found += of_parameters
+    usual = {} if task.reference is None else task.reference.lost
+    losses = [one for one in sample_loss(task.sessions) if one.beyond(usual.get(one.channel, 0.0))]
+    if losses:
+        found.append(loss_finding(losses[0]))
+    found += limit_findings(nominal.recordings, found)
+    doubts = [*claimed.doubts, *(f for f, is_one in zip(named, is_told, strict=True) if not is_one), *refuted]
+    places = {(f.cause, f.joints) for f in found}
+    doubts = [d for d in doubts if (d.cause, d.joints) not in places]
+    return in_order(sorted(found, key=lambda f: -f.gain), evidence.floor), doubts
+
+
+def _left(
+    task: Task,
+    floor: Mapping[str, Floats],
+    told: _Told,
+    findings: Sequence[Finding],
+    remainders: Sequence[Remainder],
+) -> list[Unexplained]:
+    """What neither a finding nor a term of the model explains. floor : noise (n,) [Nm] by side."""
+    fitted = {(term.side, term.joint) for term in told.nameless}
+    rms = told.after.rms()
+    left = [
+        Unexplained(r.side, r.joint, r.depends_on, *_error_and_noise(rms, floor, r.side, r.joint))
+        for r in remainders
+        if (r.side, r.joint) not in fitted and r.inflation > FELT_POWER
+    ]
+    left = [one for one in left if one.beyond_noise]
+    return [*left, *_beyond_healthy(task, told.before.rms(), rms, floor, findings, told.added, left)]
+
+
+def _simulated(task: Task, told: _Told) -> tuple[SimulationError | None, SimulationError | None]:
+    """Errors of the simulations with the present model, else the base one, and with the extended one."""
+    if task.simulate is None:
+        return None, None
+    replayed = list(task.test) or list(task.sessions)
+    present = task.simulate(task.model or told.base, replayed)
+    changed = told.extended.effects != told.base.effects
+    return present, task.simulate(told.extended, replayed) if changed else present
 
 
 def _of_present(task: Task) -> TorqueErrors | None:
