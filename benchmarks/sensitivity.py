@@ -55,7 +55,7 @@ _LEFT_OUT = (
     "_LATEST",
 )
 _IN_WORDS = ("claims_in_words", "look_alikes", "statements")
-_OF_REFERENCE = ("character", "commission", "size", "usual_sizes")
+_OF_REFERENCE = ("character", "commission", "size", "tuning", "usual_sizes")
 
 
 @dataclass(frozen=True)

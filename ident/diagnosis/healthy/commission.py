@@ -14,39 +14,40 @@ from fri.errors import ConfigurationError, DataError
 from ident.diagnosis.causes.probes import remainder_gains
 from ident.diagnosis.causes.selection import gains, select
 from ident.diagnosis.causes.tolerances import gain_rows
-from ident.diagnosis.causes.usual_sizes import scores, usual_sizes
+from ident.diagnosis.causes.usual_sizes import UsualSize, scores, usual_sizes
 from ident.diagnosis.gain.held_out import held_out
 from ident.diagnosis.gain.products import Floats, Rows
 from ident.diagnosis.healthy.bench import (
-    UNSURE,
     ArmData,
     DiagnosisBench,
     mean_delay,
     nominal_arm,
     prepare_bench,
 )
-from ident.diagnosis.healthy.channel_delays import CHANNELS, channel_delays, common_delays, mean_of
+from ident.diagnosis.healthy.channel_delays import CHANNELS, mean_of
 from ident.diagnosis.healthy.character import character
-from ident.diagnosis.healthy.day_spread import compliance_std, delay_std, gain_std, habit, largest_left
-from ident.diagnosis.healthy.presliding import SlowTurns, presliding_length, slow_turns, with_far_presliding
+from ident.diagnosis.healthy.day_spread import delay_std, gain_std, habit, largest_left
+from ident.diagnosis.healthy.presliding import SlowTurns, slow_turns, with_far_presliding
 from ident.diagnosis.healthy.reference import (
     Reference,
     shared,
-    unsure,
 )
+from ident.diagnosis.healthy.tuning import TUNING_SETS, SettledArm, later, settled_arm
 from ident.diagnosis.rows.broken_data import broken_channels, refuse, without_broken
 from ident.diagnosis.rows.noise import misfit
-from ident.diagnosis.rows.nominal_arm import STATED_WITHIN, NominalArm
+from ident.diagnosis.rows.nominal_arm import NominalArm
 from ident.diagnosis.rows.recording import SessionRecord, every_joint_moves, record, settled_for_all
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.kinematics import Chain
-from ident.effects import EncoderSide
+from ident.dynamics.structure import Coupling
 from ident.estimation.turning import drive_coulomb
 from ident.model import DynamicModel
 from ident.model.signals import SIGNALS, signals_entry
 from ident.rows.content import Recall
 from ident.rows.data_quality import all_losses
+from ident.rows.delay import Delay
+from ident.rows.filters import SignalSettings
 from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -54,15 +55,6 @@ log = logging.getLogger(__name__)
 
 # Rounds of settling the channels' delays.
 _SETTLING = 2
-_TUNING_SETS = 3
-_ROUNDS = 3
-_LATEST_S = 0.02
-# Share of the factor of a stated stiffness within which a fit is at its end.
-_END = 1.05
-# Least compliance of a joint of unknown stiffness, in its standard errors.
-_TOLD = 2.0
-# Least fall of the logarithm of the chi-square by encoders at the motors of such an arm.
-_CLEARLY = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +101,31 @@ def commission(
     settings = settings or DiagnosisSettings()
     require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
     require(settings, DiagnosisSettings, "settings", "make one with `DiagnosisSettings()`")
+    parts = _parts(sets)
+    couplings = () if arm is None else arm.couplings
+    stated = settings.signals
+    settings = settled_for_all(settings, parts[:TUNING_SETS], chain, couplings)
+    recorded = _recorded(parts, chain, stated, settings, couplings)
+    settled = settled_arm(parts, recorded, nominal_arm(chain, arm, None), settings)
+    known, days = _with_days(settled, recorded, settings)
+    found = _reference(days, known, robot or parts[0][0].metadata.get("robot", ""), parts[0])
+    provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals) | known.delays}
+    shown = _shown(recorded, days, known, found, settings)
+    return replace(
+        found,
+        model=replace(found.model, provenance=provenance),
+        null=shown.null,
+        delay_std_s=_delay_std(found.delay_std_s, settled.delays),
+        shown=shown.information,
+        usual=shown.usual,
+        compliance_std=known.compliance_std,
+        left=shown.left,
+        lost=_largest_losses(parts),
+    )
+
+
+def _parts(sets: Iterable[Sessions]) -> list[list[Session]]:
+    """The sets that are not empty, each in the order of its sessions' beginnings."""
     if isinstance(sets, (str, os.PathLike)) or not isinstance(sets, Iterable):
         raise ConfigurationError(
             f"sets: {sets!r:.60} is no list of sets; give `[first, second, ...]`, each set a list of sessions"
@@ -116,10 +133,18 @@ def commission(
     parts = [sorted(part, key=lambda s: s.start) for part in map(as_sessions, sets) if part]
     if not parts:
         raise DataError("no session given; name at least one healthy session")
-    couplings = () if arm is None else arm.couplings
-    stated = settings.signals
-    settings = settled_for_all(settings, parts[:_TUNING_SETS], chain, couplings)
-    recorded: list[list[SessionRecord]] = []
+    return parts
+
+
+def _recorded(
+    parts: Sequence[Sequence[Session]],
+    chain: Chain,
+    stated: SignalSettings,
+    settings: DiagnosisSettings,
+    couplings: Sequence[Coupling],
+) -> list[list[SessionRecord]]:
+    """The records of each set without lost channels. stated : the signals' settings before they were settled."""
+    recorded = []
     for part in parts:
         recall = Recall()
         broken = broken_channels(part, chain, stated, couplings, recall=recall)
@@ -127,51 +152,51 @@ def commission(
         records = [record(s, k, chain, settings, recall=recall) for k, s in enumerate(part)]
         recorded.append(list(without_broken(records, broken)))
         every_joint_moves(recorded[-1], chain)
-    start = replace(nominal_arm(chain, arm, None), encoder_known=True)
-    if all(one.has_effort and one.has_motor for records in recorded for one in records):
-        # One torque alone does not tell a twist from friction and inertia.
-        start = start.of_unknown_stiffness()
-    sides: tuple[EncoderSide, ...] = ("link", "motor") if np.any(start.anchor > 0.0) else ("link",)
-    first = recorded[0]
-    # Both sides in bins long enough to average the links' ringing, for a fair comparison.
-    slow = replace(settings, bin_s=max(settings.bin_s, settings.ringing_s))
-    # Of rigid joints the delays do not depend on the side.
-    rigid = None if start.compliance.any() else channel_delays(parts[0], start, settings)
-    told, tuned = {}, {}
-    for side in sides:
-        arm_of_side = replace(start, encoder=side)
-        told[side] = channel_delays(parts[0], arm_of_side, settings) if rigid is None else rigid
-        tuned[side] = _tuned(arm_of_side, first, slow, 2, common_delays([told[side]]))
-    side = _encoder(start, {one: tuned[one].misfit for one in sides})
-    log.info("positions of the %s", side)
-    delays = [
-        told[side],
-        *(channel_delays(part, tuned[side].arm, settings) for part in parts[1:_TUNING_SETS]),
-    ]
-    late = common_delays(delays)
-    one = _tuned(tuned[side].arm, first, settings, _ROUNDS, late)
-    base = one.base
-    several = [
-        one,
-        *(_tuned(one.arm, recordings, settings, 1, late) for recordings in recorded[1:_TUNING_SETS]),
-    ]
-    known = with_compliance_std(
-        _middle([tuned.arm for tuned in several]),
-        [tuned.arm.compliance for tuned in several],
-        [tuned.compliance_std for tuned in several if tuned.compliance_std is not None],
+    return recorded
+
+
+def _with_days(
+    settled: SettledArm, recorded: Sequence[Sequence[SessionRecord]], settings: DiagnosisSettings
+) -> tuple[NominalArm, list[_Day]]:
+    """The settled arm with its slow friction, open delays and own effects, and the results of each set with it."""
+
+    def days(arm: NominalArm) -> list[_Day]:
+        return [_day(arm, recordings, settings, settled.base) for recordings in recorded]
+
+    found = days(settled.arm)
+    known = with_far_presliding(
+        settled.arm, [day.slow_turns for day in found], [day.coulomb for day in found]
     )
-    days = [_day(known, recordings, settings, base) for recordings in recorded]
-    known = with_far_presliding(known, [day.slow_turns for day in days], [day.coulomb for day in days])
     for _ in range(_SETTLING):
         # The delay of a channel depends on the reversal of friction, so it is settled last.
-        days = [_day(known, recordings, settings, base) for recordings in recorded]
+        found = days(known)
         open_s = {
-            side: float(np.mean([day.late[side][0] for day in days])) for side in CHANNELS if side not in late
+            side: float(np.mean([day.late[side][0] for day in found]))
+            for side in CHANNELS
+            if side not in settled.late
         }
-        known = _later(known, open_s)
+        known = later(known, open_s)
     known = replace(known, healthy=character(known, recorded, settings))
-    days = [_day(known, recordings, settings, base) for recordings in recorded]
-    found = _reference(days, known, robot or parts[0][0].metadata.get("robot", ""), parts[0])
+    return known, days(known)
+
+
+class _Shown(NamedTuple):
+    """What each healthy set shows of the candidates against the others: mean gain (the null) and mean information by
+    shape, usual sizes; and the largest error that the others leave of one."""
+
+    null: dict[tuple[str, int], float]
+    information: dict[tuple[str, int], dict[str, float]]
+    usual: dict[tuple[str, int], UsualSize]
+    left: dict[str, Floats]
+
+
+def _shown(
+    recorded: Sequence[Sequence[SessionRecord]],
+    days: Sequence[_Day],
+    known: NominalArm,
+    found: Reference,
+    settings: DiagnosisSettings,
+) -> _Shown:
     null: dict[tuple[str, int], float] = {}
     shown: dict[tuple[str, int], dict[str, float]] = {}
     tables, left = [], []
@@ -181,38 +206,36 @@ def commission(
         if others:
             # All sets in the same noise, for their gains are compared.
             rest = replace(
-                _reference(others, known, robot, parts[0], days),
+                _reference(others, known, found.model.robot, (), days),
                 noise=found.noise,
                 correlated=found.correlated,
             )
         bench = prepare_bench(known, recordings, settings, rest, None, fit_compliance=False)
         own = gains(bench.dictionary, bench.evidence, settings)
         for key, gain in (own | remainder_gains(bench.dictionary, bench.evidence)).items():
-            null[key] = null.get(key, 0.0) + gain / len(parts)
+            null[key] = null.get(key, 0.0) + gain / len(recorded)
         tables.append(scores(bench.dictionary))
         for candidate in bench.dictionary.candidates:
             mean = shown.setdefault(candidate.key, {})
             for shape, value in bench.dictionary.information(candidate).items():
-                mean[shape] = mean.get(shape, 0.0) + value / len(parts)
+                mean[shape] = mean.get(shape, 0.0) + value / len(recorded)
         left.append(_left(known, recordings, settings, rest))
-        log.info("healthy set %d of %d", number + 1, len(parts))
-    provenance = {**found.model.provenance, SIGNALS: signals_entry(settings.signals) | known.delays}
-    # From day to day a delay differs by as much as either kind of rows shows.
-    changes = dict(found.delay_std_s)
+        log.info("healthy set %d of %d", number + 1, len(recorded))
+    return _Shown(null, shown, usual_sizes(tables), largest_left(left))
+
+
+def _delay_std(
+    by_rows: Mapping[str, float], delays: Sequence[Mapping[str, Sequence[Delay]]]
+) -> dict[str, float]:
+    """Standard deviation [s] of the delays from day to day by channel: as much as either kind of rows shows.
+
+    by_rows : by the rows of the evidence. delays : of each set, from rows away from reversals.
+    """
+    changes = dict(by_rows)
     for channel in CHANNELS:
         by_set = [mean_of(own[channel])[:2] for own in delays if own.get(channel)]
         changes[channel] = max(changes[channel], delay_std(by_set) if len(by_set) > 1 else 0.0)
-    return replace(
-        found,
-        model=replace(found.model, provenance=provenance),
-        null=null,
-        delay_std_s=changes,
-        shown=shown,
-        usual=usual_sizes(tables),
-        compliance_std=known.compliance_std,
-        left=largest_left(left),
-        lost=_largest_losses(parts),
-    )
+    return changes
 
 
 def _largest_losses(sets: Sequence[Sequence[Session]]) -> dict[str, float]:
@@ -222,122 +245,6 @@ def _largest_losses(sets: Sequence[Sequence[Session]]) -> dict[str, float]:
         if loss.amiss:
             found[loss.channel] = max(round(loss.share, 6), found.get(loss.channel, 0.0))
     return found
-
-
-class _Tuned(NamedTuple):
-    """Chi-square of a row, the arm, the standard deviation of its compliance by the set's rows, and the base set of its
-    bench."""
-
-    misfit: float
-    arm: NominalArm
-    compliance_std: Floats | None
-    base: BaseSet
-
-
-def _tuned(
-    arm: NominalArm,
-    recordings: Sequence[SessionRecord],
-    settings: DiagnosisSettings,
-    rounds: int,
-    late: Mapping[str, float],
-) -> _Tuned:
-    """The arm with stiffness and presliding fitted to a set in turns, and the delays that `late` does not have.
-
-    They are similar near a reversal, so they need a few rounds.
-    """
-    arm = replace(
-        arm,
-        motor_delay_s=late.get("motor", arm.motor_delay_s),
-        joint_delay_s=late.get("joint", arm.joint_delay_s),
-    )
-    misfit = np.inf
-    for _ in range(rounds):
-        bench = prepare_bench(arm, recordings, settings, None, (), fit_compliance=True)
-        evidence, base = bench.evidence, bench.nominal.base
-        # An unknown delay of the channels belongs to the healthy arm, whatever it is.
-        wide = (
-            settings
-            if bench.nominal.rows.keys() <= late.keys()
-            else replace(settings, delay_tolerance_s=_LATEST_S)
-        )
-        deviations = select(bench.dictionary, evidence, wide, None).deviations
-        count = max(sum(float(m.sum()) for m in evidence.mask.values()), 1.0)
-        rms = [float(np.log(v).mean()) for v in evidence.sigma.values()]
-        misfit = float(np.log(evidence.chi_square / count) + 2.0 * np.mean(rms))
-        arm = replace(
-            bench.nominal.arm,
-            presliding=presliding_length(bench.nominal, evidence.full.values[: len(base)]),
-        )
-        arm = _later(arm, {side: mean_delay(deviations, side)[0] for side in CHANNELS if side not in late})
-    return _Tuned(misfit, arm, bench.compliance_std, base)
-
-
-def _encoder(arm: NominalArm, misfits: Mapping[EncoderSide, float]) -> EncoderSide:
-    """The side of the joints that the positions come from: that of the least misfit. Of an arm whose description states
-    no stiffness, that of the motors has to be clearly less: a twist of any size takes something off."""
-    motor = misfits.get("motor", np.inf) + (_CLEARLY if arm.within > STATED_WITHIN else 0.0)
-    return "motor" if motor < misfits["link"] else "link"
-
-
-def _later(arm: NominalArm, by: Mapping[str, float]) -> NominalArm:
-    """The arm with channels later by so much [s]."""
-    return replace(
-        arm,
-        motor_delay_s=arm.motor_delay_s + by.get("motor", 0.0),
-        joint_delay_s=arm.joint_delay_s + by.get("joint", 0.0),
-    )
-
-
-def _middle(arms: Sequence[NominalArm]) -> NominalArm:
-    """The mean of tuned arms; of the presliding lengths the geometric one, 0 if most of them have none."""
-    found = np.array([arm.presliding for arm in arms])
-    seen = found > 0.0
-    lengths = np.exp(np.sum(np.log(np.where(seen, found, 1.0)), axis=0) / np.maximum(seen.sum(axis=0), 1))
-    return replace(
-        arms[0],
-        compliance=np.mean([arm.compliance for arm in arms], axis=0),
-        motor_delay_s=float(np.mean([arm.motor_delay_s for arm in arms])),
-        joint_delay_s=float(np.mean([arm.joint_delay_s for arm in arms])),
-        presliding=np.where(2 * seen.sum(axis=0) > len(arms), lengths, 0.0),
-    )
-
-
-def with_compliance_std(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = ()) -> NominalArm:
-    """The arm with the standard error of its compliance from those of the sets (n,) [rad/Nm] and by each one's rows,
-    and with the stated one, known to a factor, where encoders at the motors do not tell it: the sets do not agree on
-    one, or end at that factor. Behind encoders at the links a stated one that no set shows is unknown. Without a stated
-    one a joint is rigid where the sets do not clearly tell that it twists.
-    """
-    std = compliance_std(sets, own)
-    if arm.stated is None:
-        return replace(arm, compliance_std=std)
-    low, high = _END / arm.within * arm.stated, arm.largest_compliance / _END
-    ends = np.any([(one < low) | (one > high) for one in sets], axis=0)
-    if arm.within > STATED_WITHIN:
-        told = ~ends & (arm.compliance > (0.0 if std is None else _TOLD * std))
-        return replace(
-            arm,
-            compliance=np.where(told, arm.compliance, 0.0),
-            compliance_std=None if std is None else np.where(told, std, 0.0),
-        )
-    if std is not None:
-        # A joint that hardly moves tells nothing of its own.
-        std = np.where(np.isfinite(std), std, UNSURE * arm.stated)
-    if arm.encoder == "link":
-        # A fit that ends at a rigid joint, or at the softest one, in every set does not differ from set to set.
-        ended = (arm.compliance <= 0.0) | (arm.compliance >= high)
-        ended &= arm.stated > 0.0
-        return replace(arm, compliance_std=None if std is None else np.where(ended, UNSURE * arm.stated, std))
-    # The fit of each set is held to the stated one as far as its rows do not tell.
-    unknown = (arm.stated > 0.0) & (ends | unsure(arm.compliance, compliance_std(sets)))
-    known = np.zeros(len(arm.stated)) if std is None else std
-    if std is None and not unknown.any():
-        return arm
-    return replace(
-        arm,
-        compliance=np.where(unknown, arm.stated, arm.compliance),
-        compliance_std=np.where(unknown, UNSURE * arm.stated, known),
-    )
 
 
 def _day(

@@ -17,10 +17,10 @@ from ident.diagnosis.causes.usual_sizes import Healthy
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.healthy import bench, channel_delays
 from ident.diagnosis.healthy.channel_delays import common_delays
-from ident.diagnosis.healthy.commission import _encoder, with_compliance_std
 from ident.diagnosis.healthy.day_spread import compliance_std, delay_std, gain_std
 from ident.diagnosis.healthy.presliding import with_far_presliding
 from ident.diagnosis.healthy.reference import DELAY_STD_S, Reference
+from ident.diagnosis.healthy.tuning import _encoder, with_compliance_std
 from ident.diagnosis.rows import recording
 from ident.diagnosis.rows.nominal_arm import GAIN_STD, NominalArm
 from ident.diagnosis.settings import DiagnosisSettings
