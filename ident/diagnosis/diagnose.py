@@ -158,7 +158,7 @@ def _of_these_days(task: Task) -> tuple[Task, DiagnosisBench]:
         return task, bench
     lengths = usual
     for _ in range(_LENGTHS):
-        change = longer_turns(bench.dictionary, bench.evidence, task.settings)
+        change = longer_turns(bench.dictionary, task.settings)
         if np.max(np.abs(change)) < np.log(_ALIKE):
             break
         lengths = np.clip(lengths * np.exp(change), usual / _USUAL_LENGTHS, usual * _USUAL_LENGTHS)
@@ -174,7 +174,7 @@ def _first(task: Task, bench: DiagnosisBench) -> State:
     known = bench.repeatable or (task.reference is not None and bool(task.reference.correlated))
     if known or selection.claims:
         return State(bench, selection)
-    best = best_candidate(bench.dictionary, bench.evidence, task.settings)
+    best = best_candidate(bench.dictionary, task.settings)
     quieter = None if best is None else again_with(bench, best, task.settings, task.causes)
     if quieter is None:
         return State(bench, selection)

@@ -118,9 +118,9 @@ class Deviation:
     std: float
 
 
-def tolerances(dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings) -> list[Tolerance]:
+def tolerances(dictionary: Dictionary, settings: DiagnosisSettings) -> list[Tolerance]:
     """The tolerated deviations of an arm in the rows of a dictionary."""
-    nominal, found = dictionary.nominal, list[Tolerance]()
+    nominal, evidence, found = dictionary.nominal, dictionary.evidence, list[Tolerance]()
     limit = settings.delay_tolerance_s
     for side in nominal.rows:
         rows = dictionary.rows(Candidate(DELAYS[side], -1), Shape(delay=1e-3))

@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from ident.diagnosis.causes.candidates import Candidate, Trial
-from ident.diagnosis.causes.selection import Claim, Selection, State
+from ident.diagnosis.causes.claims import Claim
+from ident.diagnosis.causes.contest import Contest
+from ident.diagnosis.causes.selection import Selection
 from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.gain.rivals import likelihood
 from ident.diagnosis.gain.size import Size
@@ -43,7 +45,7 @@ class _Set:
     accepted: list[Trial] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.state = State(self.bench.dictionary, self.bench.evidence, self.settings)
+        self.contest = Contest(self.bench.dictionary, self.settings)
 
     def take(self, candidate: Candidate, shape: Shape) -> Trial:
         """An effect of a given shape, whatever its size in this set."""
@@ -53,11 +55,11 @@ class _Set:
 
     def found(self) -> dict[tuple[str, int], Trial]:
         """The best shape of each candidate beside what was accepted."""
-        self.state.tolerate(self.accepted)
+        self.contest.tolerated.beside(self.accepted)
         taken = {_kind(t.candidate, t.shape) for t in self.accepted}
         return {
             t.candidate.key: t
-            for t in self.state.simplest()
+            for t in self.contest.simplest()
             if _kind(t.candidate, t.shape) not in taken and not t.passing
         }
 
@@ -67,9 +69,11 @@ class _Set:
 
     def quieter(self, causes: Sequence[str]) -> _Set:
         """The same with the noise that the accepted effects leave."""
-        self.state.tolerate(self.accepted)
+        self.contest.tolerated.beside(self.accepted)
         claims = [Claim(trial, trial.score) for trial in self.accepted]
-        bench = again_with(self.bench, Selection(claims, self.state.deviations), self.settings, causes)
+        bench = again_with(
+            self.bench, Selection(claims, self.contest.tolerated.deviations), self.settings, causes
+        )
         if bench is None:
             return self
         again = _Set(bench, self.settings)
@@ -80,9 +84,7 @@ class _Set:
         """Whether each of some effects, fitted together, is part of its drive's friction where it is largest; True for
         those that are no law of the speed."""
         nominal, evidence = self.bench.nominal, self.bench.evidence
-        with evidence.beside(
-            [*(trial.rows for trial in trials), *(one.tolerance.rows for one in self.state.deviations)]
-        ):
+        with evidence.beside([*(trial.rows for trial in trials), *self.contest.tolerated.rows]):
             base, sizes = evidence.full.values[: evidence.base_count], evidence.coefficients()
         torques: dict[int, Floats] = {}
         for k, (trial, size) in enumerate(zip(trials, sizes, strict=False)):
@@ -202,7 +204,7 @@ def _reshaped(
             continue
         place = kept.index((candidate, shape))
         for one in sets:
-            one.state.tolerate([t for k, t in enumerate(one.accepted) if k != place])
+            one.contest.tolerated.beside([t for k, t in enumerate(one.accepted) if k != place])
         trials = _alike(sets, [one.trial(candidate, shape) for one in sets], settings, without=place)
         kept.pop(place)
         for one in sets:
@@ -279,9 +281,7 @@ def _fitted(one: _Set, trials: Sequence[Trial]) -> list[tuple[Floats, Floats, bo
     """Coefficients (k,) of effects fitted together, their covariance (k, k), and whether they are part of the
     friction, see `_Set.parts`."""
     evidence = one.bench.evidence
-    evidence.replace(
-        [*(trial.rows for trial in trials), *(deviation.tolerance.rows for deviation in one.state.deviations)]
-    )
+    evidence.replace([*(trial.rows for trial in trials), *one.contest.tolerated.rows])
     covariance, place, found = evidence.covariance(), evidence.base_count, []
     for value, part in zip(evidence.coefficients(), one.parts(trials), strict=False):
         here = slice(place, place + len(value))
@@ -303,7 +303,7 @@ def _of_shape(sets: Sequence[_Set], table: Sequence[Sequence[Trial]], k: int) ->
         return 0.0
     gains, sizes = dict[Shape, float](), dict[Shape, Floats]()
     for one, trials in zip(sets, table, strict=True):
-        one.state.tolerate([trial for i, trial in enumerate(trials) if i != k])
+        one.contest.tolerated.beside([trial for i, trial in enumerate(trials) if i != k])
         for other in (shape, *candidate.effect.shapes(one.bench.dictionary.setting, candidate.joint)):
             trial = one.trial(candidate, other) if other.form is shape.form else None
             if trial is not None:

@@ -211,7 +211,7 @@ def _shown(
                 correlated=found.correlated,
             )
         bench = prepare_bench(known, recordings, settings, rest, None, fit_compliance=False)
-        own = gains(bench.dictionary, bench.evidence, settings)
+        own = gains(bench.dictionary, settings)
         for key, gain in (own | remainder_gains(bench.dictionary, bench.evidence)).items():
             null[key] = null.get(key, 0.0) + gain / len(recorded)
         tables.append(scores(bench.dictionary))
@@ -258,7 +258,7 @@ def _day(
         )
     evidence = bench.evidence
     # `select` adds the tolerated deviations to the base.
-    selection = select(bench.dictionary, evidence, settings, None)
+    selection = select(bench.dictionary, settings, None)
     p = evidence.base_count
     values = evidence.full.values[:p].copy()
     residual = evidence.residuals()
@@ -294,7 +294,7 @@ def _left(
     last = max((k for k, one in enumerate(payloads) if payloads.count(one) > 1), default=-1)
     held = [replace(one, test=k == last) for k, one in enumerate(recordings)]
     bench = prepare_bench(arm, held, settings, reference, (), fit_compliance=False)
-    nuisance = select(bench.dictionary, bench.evidence, settings, None).nuisance_rows
+    nuisance = select(bench.dictionary, settings, None).nuisance_rows
     return held_out(bench.evidence, nuisance).rms()
 
 

@@ -139,7 +139,7 @@ def _tuned(
             if bench.nominal.rows.keys() <= late.keys()
             else replace(settings, delay_tolerance_s=_LATEST_S)
         )
-        deviations = select(bench.dictionary, evidence, wide, None).deviations
+        deviations = select(bench.dictionary, wide, None).deviations
         count = max(sum(float(m.sum()) for m in evidence.mask.values()), 1.0)
         rms = [float(np.log(v).mean()) for v in evidence.sigma.values()]
         misfit = float(np.log(evidence.chi_square / count) + 2.0 * np.mean(rms))

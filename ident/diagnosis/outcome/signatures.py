@@ -81,7 +81,7 @@ def signature_bench(
     bench = prepare_bench(
         known, ready.recordings, ready.settings, reference, (), fit_compliance=reference is None
     )
-    select(bench.dictionary, bench.evidence, ready.settings)
+    select(bench.dictionary, ready.settings)
     return bench
 
 

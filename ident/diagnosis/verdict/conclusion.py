@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import DataError
+from ident.diagnosis.causes.claims import Claim
 from ident.diagnosis.causes.probes import Remainder, find_remainders
-from ident.diagnosis.causes.selection import Claim
 from ident.diagnosis.causes.tolerances import Kind
 from ident.diagnosis.gain.held_out import BEYOND_HEALTHY, HeldOut, held_out, worse_rows
 from ident.diagnosis.gain.products import Floats, Rows

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ident.diagnosis.causes.claims import Claim
 from ident.diagnosis.causes.model_form import model_form_error
 from ident.diagnosis.causes.probes import Remainder, find_remainders
-from ident.diagnosis.causes.selection import Claim
 from ident.diagnosis.gain.held_out import HeldOut, fall, held_out, spread_out, worse_rows
 from ident.diagnosis.gain.products import Rows
 from ident.diagnosis.healthy.bench import DiagnosisBench

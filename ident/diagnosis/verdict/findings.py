@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ident.diagnosis.causes.candidates import Trial
+from ident.diagnosis.causes.claims import Claim
 from ident.diagnosis.causes.intervals import estimated
 from ident.diagnosis.causes.model_form import companions
-from ident.diagnosis.causes.selection import Claim
 from ident.diagnosis.causes.tolerances import usual_change
 from ident.diagnosis.gain.held_out import HeldOut, interval
 from ident.diagnosis.gain.products import Floats, Key

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from ident.diagnosis.causes.candidates import Candidate
-from ident.diagnosis.causes.selection import Claim, Selection
+from ident.diagnosis.causes.claims import Claim
+from ident.diagnosis.causes.selection import Selection
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.healthy.bench import DiagnosisBench, slow_delay
 from ident.diagnosis.healthy.channel_delays import ONE_IN

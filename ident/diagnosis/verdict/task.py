@@ -73,7 +73,7 @@ class Task:
 
     def select(self, bench: DiagnosisBench) -> Selection:
         """The causes supported by the data of a bench."""
-        return select(bench.dictionary, bench.evidence, self.settings, self.healthy)
+        return select(bench.dictionary, self.settings, self.healthy)
 
 
 @dataclass(frozen=True, eq=False)

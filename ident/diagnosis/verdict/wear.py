@@ -16,8 +16,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ident.diagnosis.causes.claims import Claim
 from ident.diagnosis.causes.probes import Remainder, find_remainders
-from ident.diagnosis.causes.selection import Claim
 from ident.diagnosis.causes.tolerances import gain_rows
 from ident.diagnosis.gain.held_out import HeldOut
 from ident.diagnosis.gain.products import Floats, Rows

@@ -208,7 +208,7 @@ def test_a_compliance_is_tolerated_within_what_is_unknown_of_it() -> None:
         compliance_std=np.array([0.5e-4, 1e-7]),
     )
     dictionary = Dictionary(bench.nominal, bench.evidence, ["joint_elasticity"])
-    found = {one.name: one.size for one in tolerances(dictionary, bench.evidence, DiagnosisSettings())}
+    found = {one.name: one.size for one in tolerances(dictionary, DiagnosisSettings())}
     # A stated stiffness to a factor of two, and one learned from healthy sets to a usual share.
     assert found["compliance 1"] == pytest.approx(1e-4)
     assert found["compliance 2"] == pytest.approx(0.12e-4)

@@ -5,14 +5,16 @@ from __future__ import annotations
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ident.diagnosis.causes.candidates import Candidate, Trial
+from ident.diagnosis.causes.contest import Contest
 from ident.diagnosis.causes.healthy_null import HealthyNull
-from ident.diagnosis.causes.selection import State
 from ident.diagnosis.causes.tolerances import Kind, Tolerance
+from ident.diagnosis.causes.tolerated import Tolerated
 from ident.diagnosis.causes.usual_sizes import Healthy
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.healthy import bench, channel_delays
@@ -308,21 +310,19 @@ def test_habits_of_healthy_days_are_tolerated_beside_every_cause(chain: Chain) -
         "gear_ripple": Trial(Candidate(EFFECTS["gear_ripple"], 1), Shape(), _score(400.0, 2), {}),
         "cable_spring": Trial(Candidate(EFFECTS["cable_spring"], 2), Shape(), _score(120.0), {}),
     }
-    state = State(None, None, DiagnosisSettings())  # type: ignore[arg-type]
-    state._tolerances = []
+    contest: Any = Contest(None, DiagnosisSettings())  # type: ignore[arg-type]
+    contest.tolerated.known = []
     usual = {"stribeck": True, "gear_ripple": True, "cable_spring": False}
-    state.carried = lambda trial, score=None, *, healthy=True: (  # type: ignore[method-assign]
-        not healthy or not usual[trial.candidate.cause]
-    )
+    contest.enough.carried = lambda trial, healthy=True: not healthy or not usual[trial.candidate.cause]
     found = sorted(trials.values(), key=lambda t: -t.score.gain)
     # Several coefficients are a shape of their own; one is a size that changes from day to day.
-    assert state.habit(found)
-    assert [one.of for one in state.tolerated()] == [("stribeck", 0)]
-    assert not state.habit([trials["gear_ripple"]])
-    assert not state.habit([trials["cable_spring"]])
+    assert contest.habit(found)
+    assert [one.of for one in contest.tolerated.known] == [("stribeck", 0)]
+    assert not contest.habit([trials["gear_ripple"]])
+    assert not contest.habit([trials["cable_spring"]])
     usual["cable_spring"] = True
     # Far below the best candidate it changes little.
-    assert not state.habit([trials["gear_ripple"], trials["cable_spring"]])
+    assert not contest.habit([trials["gear_ripple"], trials["cable_spring"]])
 
 
 def test_what_is_unusual_beside_a_habit_alone_is_no_claim(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -334,23 +334,25 @@ def test_what_is_unusual_beside_a_habit_alone_is_no_claim(monkeypatch: pytest.Mo
     trial = replace(trial, score=clear)
     elsewhere = replace(trial, rows={("motor", 1): np.ones((3, 1))})
 
-    def state(alone: float) -> State:
-        dictionary = SimpleNamespace(trial=lambda *_: replace(trial, score=_score(alone)))
+    def contest(alone: float) -> Contest:
         evidence = SimpleNamespace(extra=[here], replace=lambda extra: None)
-        found = State(dictionary, evidence, DiagnosisSettings())  # type: ignore[arg-type]
-        found._tolerances = [habit]
+        dictionary: Any = SimpleNamespace(
+            trial=lambda *_: replace(trial, score=_score(alone)), evidence=evidence
+        )
+        found = Contest(dictionary, DiagnosisSettings())
+        found.tolerated.known = [habit]
         return found
 
-    monkeypatch.setattr(State, "tolerate", lambda self, accepted: None)
+    monkeypatch.setattr(Tolerated, "beside", lambda self, accepted: None)
     monkeypatch.setattr(HealthyNull, "exceeded", lambda self, trial: trial.score.gain > 500.0)
     monkeypatch.setattr(HealthyNull, "limit", lambda self, trial: 0.0)
-    assert not state(100.0).carried(trial)
-    assert state(800.0).carried(trial)
-    assert state(100.0).carried(elsewhere)
-    assert state(100.0).carried(trial, healthy=False)
-    kept = state(100.0)
-    kept.carried(trial)
-    assert kept.tolerated() == [habit]
+    assert not contest(100.0).enough.carried(trial)
+    assert contest(800.0).enough.carried(trial)
+    assert contest(100.0).enough.carried(elsewhere)
+    assert contest(100.0).enough.carried(trial, healthy=False)
+    kept = contest(100.0)
+    kept.enough.carried(trial)
+    assert kept.tolerated.known == [habit]
 
 
 def test_a_limit_grows_with_the_information_of_the_motion_and_falls_with_none() -> None:

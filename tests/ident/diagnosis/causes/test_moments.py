@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ident.diagnosis.causes.candidates import Candidate, Dictionary, Trial
-from ident.diagnosis.causes.selection import State, _same_moment
+from ident.diagnosis.causes.contest import Contest, same_moment
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import EFFECTS, Shape
@@ -21,14 +21,14 @@ def push(time: float, duration: float, session: float = 1.0) -> Trial:
 
 def test_what_a_push_leaves_while_it_lasts_is_no_second_one() -> None:
     first = push(4.0, 1.0)
-    assert _same_moment(push(4.4, 0.3), first)
-    assert _same_moment(push(4.7, 0.3), first)
-    assert not _same_moment(push(6.0, 0.3), first)
-    assert not _same_moment(push(4.0, 1.0, session=2.0), first)
+    assert same_moment(push(4.4, 0.3), first)
+    assert same_moment(push(4.7, 0.3), first)
+    assert not same_moment(push(6.0, 0.3), first)
+    assert not same_moment(push(4.0, 1.0, session=2.0), first)
     load = Trial(
         Candidate(EFFECTS["payload_change"], -1), {"time": 4.0, "session": 1.0}, cast(Score, None), {}
     )
-    assert not _same_moment(load, first)
+    assert not same_moment(load, first)
 
 
 def scored(gain: float, *coefficients: float, std: float = 1.0) -> Score:
@@ -40,9 +40,9 @@ def test_of_two_pushes_that_a_search_of_times_brought_together_the_stronger_is_t
     first, second = (
         replace(push(at, 0.8), score=scored(gain, 5.0)) for at, gain in ((17.7, 900.0), (17.5, 60.0))
     )
-    state = State(None, None, DiagnosisSettings())  # type: ignore[arg-type]
-    assert state.leftover(second, [first])
-    assert not state.leftover(first, [second])
+    contest = Contest(None, DiagnosisSettings())  # type: ignore[arg-type]
+    assert contest.leftover(second, [first])
+    assert not contest.leftover(first, [second])
 
 
 @pytest.mark.parametrize(("std", "form"), [(0.2, "linear"), (0.02, "hardening")])

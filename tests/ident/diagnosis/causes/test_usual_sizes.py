@@ -10,8 +10,8 @@ import pytest
 
 from fri.errors import ConfigurationError
 from ident.diagnosis.causes.candidates import Candidate, Trial
+from ident.diagnosis.causes.claims import Claim
 from ident.diagnosis.causes.healthy_null import HealthyNull
-from ident.diagnosis.causes.selection import Claim
 from ident.diagnosis.causes.usual_sizes import Healthy, UsualSize, scatter_limits, usual_sizes
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.settings import DiagnosisSettings

@@ -9,7 +9,7 @@ import pytest
 
 from ident.diagnosis import DiagnosisSettings
 from ident.diagnosis.causes.candidates import Candidate, Trial
-from ident.diagnosis.causes.selection import State
+from ident.diagnosis.causes.contest import Contest
 from ident.diagnosis.gain.rivals import confidence, look_alikes
 from ident.diagnosis.outcome.signatures import signature_bench
 from ident.dynamics.kinematics import Chain
@@ -23,19 +23,19 @@ def test_two_causes_in_the_same_rows_do_not_compete(make: Callable[..., Session]
         s["motor"][:, 1] += 0.4 * np.sign(v) * np.exp(-np.abs(v) / 0.15) + 0.6 * np.sin(12.0 * q)
 
     bench = signature_bench([make("a.mcap", 1, rough), make("b.mcap", 2, rough, 1)], chain)
-    state = State(bench.dictionary, bench.evidence, DiagnosisSettings())
+    contest = Contest(bench.dictionary, DiagnosisSettings())
 
     def trial(cause: str, **shape: float) -> Trial:
         found = bench.dictionary.trial(Candidate(EFFECTS[cause], 1), Shape(**shape))
         assert found is not None
         return found
 
-    state.tolerate([])
+    contest.tolerated.beside([])
     here = trial("stribeck", velocity=0.15, exponent=1.0)
     other_form = trial("stribeck", velocity=0.25, exponent=1.0)
     ripple = trial("gear_ripple", cycles_per_turn=12.0, gear_ratio=1.0)
     assert ripple.score.gain > here.score.gain > 0.0
-    assert state.competing(here, [ripple, other_form], []) == [other_form]
+    assert contest.competing(here, [ripple, other_form], []) == [other_form]
 
 
 @pytest.mark.parametrize(("own", "left"), [(0.0, 1), (3.0, 2)])
@@ -49,16 +49,16 @@ def test_a_hose_leaves_a_spring_at_its_second_joint_only_what_it_does_not_explai
             s[side][:, 2] += 1.1 * pull + own * s["q"][:, 2] ** 3
 
     bench = signature_bench([make("a.mcap", 1, hose), make("b.mcap", 2, hose, 1)], chain)
-    state = State(bench.dictionary, bench.evidence, DiagnosisSettings())
-    state.tolerate([])
+    contest = Contest(bench.dictionary, DiagnosisSettings())
+    contest.tolerated.beside([])
     spring = Candidate(EFFECTS["cable_spring"], 2)
     alone = bench.dictionary.best(spring)
     assert alone is not None
-    state.tolerate([alone])
+    contest.tolerated.beside([alone])
     both = bench.dictionary.best(Candidate(EFFECTS["cable_spring"], 1))
     assert both is not None
     assert both.shape.form_name == "over two joints"
-    kept = state.merged([alone, both])
+    kept = contest.merged([alone, both])
     assert [t.candidate.joint for t in kept] == [2, 1][-left:]
 
 
@@ -67,19 +67,19 @@ def test_best_shapes_are_found_once_beside_the_same_columns_and_anew_beside_othe
 ) -> None:
     bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
 
-    def state() -> State:
+    def contest() -> Contest:
         causes = bench.dictionary.of(["stribeck", "gear_ripple"])
-        return State(causes, bench.evidence, DiagnosisSettings())
+        return Contest(causes, DiagnosisSettings())
 
-    one, other = state(), state()
-    one.tolerate([])
+    one, other = contest(), contest()
+    one.tolerated.beside([])
     alone = one.simplest()
-    one.tolerate(alone[:1])
+    one.tolerated.beside(alone[:1])
     beside = one.simplest()
-    one.tolerate([])
+    one.tolerated.beside([])
     assert one.simplest() is alone
     for accepted, found in (([], alone), (alone[:1], beside)):
-        other.tolerate(accepted)
+        other.tolerated.beside(accepted)
         again = other.simplest()
         assert again is not found
         assert [t.candidate.key for t in again] == [t.candidate.key for t in found]
@@ -96,18 +96,18 @@ def test_what_two_look_alikes_share_counts_for_the_other_one(
         s["motor"][:, 1] += 0.4 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
 
     bench = signature_bench([make("a.mcap", 1, rough), make("b.mcap", 2, rough, 1)], chain)
-    state = State(bench.dictionary, bench.evidence, DiagnosisSettings())
+    contest = Contest(bench.dictionary, DiagnosisSettings())
     stribeck = Candidate(EFFECTS["stribeck"], 1)
     shapes = [Shape(velocity=speed, exponent=1.0) for speed in (0.15, 0.2)]
 
     def trials() -> list[Trial]:
         return [t for t in (bench.dictionary.trial(stribeck, shape, 1) for shape in shapes) if t is not None]
 
-    state.tolerate([])
+    contest.tolerated.beside([])
     alone = trials()
-    state.tolerate(alone[1:])
+    contest.tolerated.beside(alone[1:])
     beside = trials()[0].score.gain
-    (other,) = state.others(alone, 1)
+    (other,) = contest.others(alone, 1)
     assert other.shape == shapes[0]
     assert np.isclose(other.score.gain, alone[0].score.gain)
     assert other.score.gain > 5.0 * max(beside, 1.0)

@@ -118,8 +118,8 @@ def test_an_accepted_effect_stays_once_whatever_its_size_in_a_set_of_less_noise(
         return SimpleNamespace(dictionary=dictionary, evidence=None)
 
     monkeypatch.setattr("ident.diagnosis.healthy.character.again_with", lambda *_: bench())
-    monkeypatch.setattr("ident.diagnosis.healthy.character.State.tolerate", lambda self, accepted: None)
-    monkeypatch.setattr("ident.diagnosis.healthy.character.State.simplest", lambda self: [trial(0.3, 90.0)])
+    monkeypatch.setattr("ident.diagnosis.causes.tolerated.Tolerated.beside", lambda self, accepted: None)
+    monkeypatch.setattr("ident.diagnosis.healthy.character.Contest.simplest", lambda self: [trial(0.3, 90.0)])
     one = _Set(bench(), DiagnosisSettings(), [trial(0.4, 90.0)])  # type: ignore[arg-type]
     quieter = one.quieter(["stribeck"])
     assert [t.candidate.key for t in quieter.accepted] == [STRIBECK.key]

@@ -10,7 +10,8 @@ from scipy.signal import correlate
 
 import ident.diagnosis.healthy.bench as bench_module
 from ident.diagnosis.causes.candidates import Candidate, Trial
-from ident.diagnosis.causes.selection import Claim, Selection
+from ident.diagnosis.causes.claims import Claim
+from ident.diagnosis.causes.selection import Selection
 from ident.diagnosis.healthy.bench import again_with
 from ident.diagnosis.outcome.signatures import signature_bench
 from ident.diagnosis.rows.noise import misfit

@@ -12,7 +12,7 @@ import pytest
 
 from ident.diagnosis import diagnose
 from ident.diagnosis.causes.candidates import Candidate, Trial
-from ident.diagnosis.causes.selection import Claim
+from ident.diagnosis.causes.claims import Claim
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.outcome.result import Finding, FindingEvidence, Value
 from ident.diagnosis.settings import DiagnosisSettings
