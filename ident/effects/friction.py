@@ -21,7 +21,7 @@ from ident.effects.effect import (
     Shape,
     Simulated,
 )
-from ident.effects.motion import ArmMotion, Floats, turned_friction
+from ident.effects.motion import ArmMotion, Floats, dahl_after, turned_friction
 from ident.effects.words import Values, quantity, quantity_text, times, wave
 
 # Usual standard deviation of an effect of friction from day to day as a share of it: films depend on everything.
@@ -31,9 +31,7 @@ _FRICTION = 0.2
 def dahl_step(run: Simulated, here: float, length: float) -> float:
     """Dahl's state of a simulated effect at the coordinate `here`, one cycle later."""
     state, before = run.state or (0.0, here)
-    step = here - before
-    sign = 1.0 if step > 0.0 else -1.0
-    run.state = sign - (sign - state) * float(np.exp(-abs(step) / length)), here
+    run.state = float(dahl_after(state, here - before, length)), here
     return float(run.state[0])
 
 

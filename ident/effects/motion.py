@@ -221,22 +221,30 @@ def in_order(motions: Sequence[ArmMotion]) -> list[ArmMotion]:
     return found
 
 
+def dahl_after(z, step, length):  # type: ignore[no-untyped-def]
+    """State z in [-1, 1] of Dahl's friction after a step dx along its path: dz = (1 - z sign(dx)) dx / length.
+
+    Integrated exactly over the step, so any step is stable. Dahl, Solid friction damping of mechanical vibrations,
+    AIAA Journal 14 (1976).
+    """
+    if step > 0.0:
+        return 1.0 - (1.0 - z) * np.exp(-step / length)
+    if step < 0.0:
+        return -1.0 + (1.0 + z) * np.exp(step / length)
+    return z
+
+
+_after = njit(cache=True, nogil=True)(dahl_after)
+
+
 @njit(cache=True, nogil=True)
 def dahl(path, length, start):  # type: ignore[no-untyped-def]
-    """State z (N,) in [-1, 1] of Dahl's friction along `path` (N,): dz = (1 - z sign(dx)) dx / length.
-
-    Integrated exactly over each step, so any step is stable. Dahl, Solid friction damping of mechanical
-    vibrations, AIAA Journal 14 (1976).
-    """
+    """States (N,) of Dahl's friction along `path` (N,), see `dahl_after`."""
     out = np.empty(path.shape[0])
     z = start
     out[0] = z
     for k in range(1, path.shape[0]):
-        step = path[k] - path[k - 1]
-        if step > 0.0:
-            z = 1.0 - (1.0 - z) * np.exp(-step / length)
-        elif step < 0.0:
-            z = -1.0 + (1.0 + z) * np.exp(step / length)
+        z = _after(z, path[k] - path[k - 1], length)
         out[k] = z
     return out
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, ArmMotion, Setting, Shape, check_entry, find_effect
+from ident.effects.friction import dahl_step
 from ident.effects.load import leaning, slide
 from ident.effects.motion import dahl
 from tests.ident.effects.swing import swing
@@ -135,6 +137,13 @@ def test_dahl_turns_over_within_its_length() -> None:
     state = dahl(path, 0.01, 0.0)
     assert state[499] == pytest.approx(1.0, abs=1e-9)
     assert state[-1] == pytest.approx(-1.0 + 2.0 * np.exp(-1.0), abs=1e-6)
+
+
+def test_a_simulated_effect_turns_as_dahl_does_along_the_whole_path() -> None:
+    path = np.concatenate([np.linspace(0.0, 0.02, 50), np.full(5, 0.02), np.linspace(0.02, 0.015, 30)])
+    run: Any = SimpleNamespace(state=None)
+    steps = [dahl_step(run, float(here), 0.01) for here in path]
+    np.testing.assert_allclose(steps, dahl(path, 0.01, 0.0), rtol=1e-14)
 
 
 def test_unknown_cause_names_the_nearest() -> None:
