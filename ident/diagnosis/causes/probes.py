@@ -9,8 +9,9 @@ extended model, or is reported by its variables; a large one casts doubt on the 
 from __future__ import annotations
 
 from bisect import insort
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -36,6 +37,8 @@ _STANDS_OUT = 16.0
 _IN_EACH = 4.0
 # Zero padding of the spectrum, against lines between two of its frequencies.
 _PADDING = 4
+# Fewest rows of a torque in which functions of many knots are searched.
+_LEAST_ROWS = 100
 _RIDGE = 1e-3
 # Least explained share of the noise; generic functions find a little everywhere.
 _LEAST_INFLATION = 0.012
@@ -192,29 +195,46 @@ class Remainder:
     terms: tuple[Term, ...] = field(default=(), repr=False)
 
 
+class _Searched(NamedTuple):
+    """What is searched in the residual of a torque with rows enough: groups of columns by the names of their variables,
+    and a line of its spectrum."""
+
+    side: str
+    joint: int
+    groups: Mapping[str, Rows]
+    line: tuple[float, Rows, int] | None
+
+
+def _searched(dictionary: Dictionary, variables: Mapping[str, Curve]) -> Iterator[_Searched]:
+    """For each torque beside the present columns of the evidence."""
+    evidence = dictionary.evidence
+    residuals = evidence.residuals()
+    for side in evidence.nominal.rows:
+        for joint in range(evidence.nominal.arm.chain.n):
+            if evidence.mask[side, joint].sum() >= _LEAST_ROWS:
+                line = find_line(evidence, side, joint, residuals[side][:, joint])
+                yield _Searched(side, joint, groups(dictionary, variables, side, joint), line)
+
+
 def find_remainders(
-    dictionary: Dictionary, evidence: Evidence, settings: DiagnosisSettings, null: Null | None = None
+    dictionary: Dictionary, settings: DiagnosisSettings, null: Null | None = None
 ) -> tuple[Remainder, ...]:
     """Remainders beside the columns of the evidence, largest first; at most two variables each.
 
     null : limits of their gain on the healthy arm, by name of the nameless term.
     """
     found = []
-    variables, residuals = hats_of(dictionary), evidence.residuals()
-    for side in evidence.nominal.rows:
-        for joint in range(evidence.nominal.arm.chain.n):
-            if evidence.mask[side, joint].sum() < 100:
-                continue
-            line = find_line(evidence, side, joint, residuals[side][:, joint])
-            prepared: dict[str, tuple[Rows, dict[Key, Floats], Products]] = {}
-            for name, rows in groups(dictionary, variables, side, joint).items():
-                padded = evidence.padded(rows)
-                prepared[name] = rows, padded, evidence.alone(padded)
-            least = max(settings.least_gain, (null or {}).get((NAMELESS[side].cause, joint), 0.0))
-            with evidence.beside(evidence.extra):
-                remainder = _one(evidence, least, prepared, line, side, joint, variables)
-            if remainder is not None:
-                found.append(remainder)
+    evidence, variables = dictionary.evidence, hats_of(dictionary)
+    for one in _searched(dictionary, variables):
+        prepared: dict[str, tuple[Rows, dict[Key, Floats], Products]] = {}
+        for name, rows in one.groups.items():
+            padded = evidence.padded(rows)
+            prepared[name] = rows, padded, evidence.alone(padded)
+        least = max(settings.least_gain, (null or {}).get((NAMELESS[one.side].cause, one.joint), 0.0))
+        with evidence.beside(evidence.extra):
+            remainder = _one(evidence, least, prepared, one.line, one.side, one.joint, variables)
+        if remainder is not None:
+            found.append(remainder)
     return tuple(sorted(found, key=lambda r: -r.gain))
 
 
@@ -266,22 +286,15 @@ def _term(name: str, score: Score, rows: Rows, variables: Mapping[str, Curve]) -
     return Term(name, curve.low, curve.high, score.coefficients, np.sqrt(np.diag(score.covariance)), column)
 
 
-def remainder_gains(dictionary: Dictionary, evidence: Evidence) -> dict[tuple[str, int], float]:
+def remainder_gains(dictionary: Dictionary) -> dict[tuple[str, int], float]:
     """Largest gain of a function of the motion or of a line beside the columns of the evidence, by the name of the
     nameless term and the joint from 0."""
     found = {}
-    variables, residuals = hats_of(dictionary), evidence.residuals()
-    for side in evidence.nominal.rows:
-        for joint in range(evidence.nominal.arm.chain.n):
-            if evidence.mask[side, joint].sum() < 100:
-                continue
-            scores = [
-                evidence.score(evidence.padded(rows), ridge=_RIDGE)
-                for rows in groups(dictionary, variables, side, joint).values()
-            ]
-            line = find_line(evidence, side, joint, residuals[side][:, joint])
-            scores += [] if line is None else [evidence.score(evidence.padded(line[1]))]
-            found[NAMELESS[side].cause, joint] = max(0.0, *(score.gain for score in scores))
+    evidence = dictionary.evidence
+    for one in _searched(dictionary, hats_of(dictionary)):
+        scores = [evidence.score(evidence.padded(rows), ridge=_RIDGE) for rows in one.groups.values()]
+        scores += [] if one.line is None else [evidence.score(evidence.padded(one.line[1]))]
+        found[NAMELESS[one.side].cause, one.joint] = max(0.0, *(score.gain for score in scores))
     return found
 
 

@@ -212,7 +212,7 @@ def _shown(
             )
         bench = prepare_bench(known, recordings, settings, rest, None, fit_compliance=False)
         own = gains(bench.dictionary, settings)
-        for key, gain in (own | remainder_gains(bench.dictionary, bench.evidence)).items():
+        for key, gain in (own | remainder_gains(bench.dictionary)).items():
             null[key] = null.get(key, 0.0) + gain / len(recorded)
         tables.append(scores(bench.dictionary))
         for candidate in bench.dictionary.candidates:

@@ -121,7 +121,7 @@ def _believed(task: Task, state: State, borne_out: Sequence[Confirmed]) -> _Clai
     def remainders(some: Sequence[Confirmed]) -> tuple[Remainder, ...]:
         evidence = state.bench.evidence
         evidence.replace([*(one.claim.trial.rows for one in some), *state.selection.nuisance_rows])
-        return find_remainders(state.bench.dictionary, evidence, task.settings, task.limits)
+        return find_remainders(state.bench.dictionary, task.settings, task.limits)
 
     kept = [one for one in borne_out if not is_level(one.claim)]
     left = remainders(kept)

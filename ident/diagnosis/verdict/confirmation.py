@@ -301,7 +301,7 @@ def _beyond(
     if not remainders or not wide:
         return remainders
     bench.evidence.replace([*(c.trial.rows for c in claims), *nuisance, *wide])
-    return find_remainders(bench.dictionary, bench.evidence, task.settings, task.limits)
+    return find_remainders(bench.dictionary, task.settings, task.limits)
 
 
 def _encompassed(

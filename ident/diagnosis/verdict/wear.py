@@ -152,7 +152,7 @@ def _left(
         return 0.0
     evidence = bench.evidence
     evidence.replace(columns)
-    return mine(find_remainders(bench.dictionary, evidence, evidence.settings, reference.limits()))
+    return mine(find_remainders(bench.dictionary, evidence.settings, reference.limits()))
 
 
 def _errors(
