@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,87 @@ def prepare(
     Raises DataError for too few samples, times that do not increase, non-finite values, no torque, no motion.
     """
     name, recall = session.path.name, recall or Recall()
+    joint = _joint_channel(session, motor)
+    settings = (settings or SignalSettings()).settled(1.0 / joint.dt)
+    moved = _moved(session, joint, settings, blocks, recall)
+    warnings = list(moved.warnings)
+    motor_data, delay = None, None
+    if motor and session.motor is not None:
+        motor_data = _motor(session, joint.origin, settings, name, warnings, recall)
+        if joint.clock is not None:
+            motor_data = (joint.clock.at(motor_data[0], joint.stamps), *motor_data[1:])
+        springs = _stiffness(settings, session.joint_names) if joint.sensed else None
+        delay = _delay(motor_data, moved.motions, session.joint_names, settings, springs, joint.sensed)
+        warnings += _doubts(delay, name)
+    grid = moved.grid
+    passages = _motors_shelved(_passages(moved.motions, grid, moved.windows, motor_data, delay, settings))
+    if not joint.sensed:
+        passages = [replace(p, joint_valid=np.zeros_like(p.joint_valid)) for p in passages]
+    if not passages:
+        _refuse_short(name, settings)
+    advised = advice(
+        settings,
+        excitation_hz=moved.excitation_hz,
+        joint_rate_hz=1.0 / joint.dt,
+        motor_rate_hz=None if motor_data is None else 1.0 / median_step(motor_data[0]),
+        resonance_hz=resonance_hz,
+    )
+    warnings += advised if advise else ()
+    counts = {
+        "lost": moved.lost,
+        **moved.flagged,
+        "motor_torque_outliers": 0 if motor_data is None else int(motor_data[2].sum()),
+        "stretches": moved.stretches,
+        "resampled": int(moved.resampled),
+        "rows": sum(len(passage.rows) for passage in passages),
+        "joint_rows_dropped": sum(int((~passage.joint_valid).sum()) for passage in passages),
+        "motor_rows_dropped": sum(
+            int((~passage.motor_valid).sum()) for passage in passages if passage.motor_valid is not None
+        ),
+    }
+    for warning in warnings if log else ():
+        logger.warning("%s", warning)
+    return PreparedSession(
+        name=name,
+        joint_names=session.joint_names,
+        settings=settings,
+        passages=tuple(passages),
+        row_time_s=float(grid[1] - grid[0]) if len(grid) > 1 else 1.0 / settings.row_rate_hz,
+        period_rows=moved.period_rows,
+        periods=len(moved.windows) if moved.period_rows else 0,
+        delay=delay,
+        excitation_hz=moved.excitation_hz,
+        cutoff_hz=settings.cutoff,
+        moving=moved.moving,
+        counts=counts,
+        warnings=tuple(warnings),
+        uid=session.metadata.get("uid", ""),
+        mean_torque=_mean_torque(passages) if joint.sensed else (),
+        jitter_s=None if joint.clock is None else joint.clock.jitter_s,
+        joint_delay=_joint_delay(settings) if joint.sensed else None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _JointChannel:
+    """Times of the joint channel's samples, of period dt [s].
+
+    origin : of the stamps [ns]. stamps, times : (N,) [s], as recorded and by the clock that counts, if there is one.
+    effort : (N, n) [Nm], zeros where the torques are not `sensed`.
+    """
+
+    origin: int
+    stamps: Floats
+    clock: SampleClock | None
+    times: Floats
+    dt: float
+    effort: Floats
+    sensed: bool
+
+
+def _joint_channel(session: Session, motor: bool) -> _JointChannel:
+    """The channel, checked. motor : whether a motor channel may stand for joint torques."""
+    name = session.path.name
     _check_finite(session.joint, name)
     origin = int(clock_ns(session.joint)[0])
     stamps = np.asarray((clock_ns(session.joint) - origin) * 1e-9, dtype=np.float64)
@@ -97,15 +178,41 @@ def prepare(
             )
         effort = np.zeros_like(position)
     dt = sample_period(times, session.joint.counts, f"{name}: /joint_states")
-    settings = (settings or SignalSettings()).settled(1.0 / dt)
-    warnings: list[str] = []
+    return _JointChannel(origin, stamps, clock, times, dt, effort, sensed)
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """The filtered motions of a session and the times of its rows.
+
+    excitation_hz : upper frequency of the motion. moving : names of the moving joints. lost, flagged : samples lost and
+    by flag. stretches : their number; resampled : whether any is. windows, grid : spans and times of the rows [s].
+    period_rows : rows in a period, if the periods are equal.
+    """
+
+    motions: list[Motion]
+    excitation_hz: float
+    moving: tuple[str, ...]
+    lost: int
+    flagged: dict[str, int]
+    stretches: int
+    resampled: bool
+    windows: list[tuple[float, float]]
+    grid: Floats
+    period_rows: int | None
+    warnings: list[str]
+
+
+def _moved(
+    session: Session, joint: _JointChannel, settings: SignalSettings, blocks: bool, recall: Recall
+) -> _Moved:
+    name, names = session.path.name, session.joint_names
+    position, effort = session.joint.position, joint.effort
     position_flags, crowded = _outliers(position, settings, recall)
     effort_flags, also = _outliers(effort, settings, recall)
-    seen = recall.of(partial(_seen, session.joint, times, clock), session.joint)
+    seen = recall.of(partial(_seen, session.joint, joint.times, joint.clock), session.joint)
     kept, stuck = seen.held, frozen_flags(seen.torques, effort.shape)
     effort_flags = effort_flags | kept[:, None] | stuck
-    warnings += _jumping(name, "position", session.joint_names, crowded)
-    warnings += _jumping(name, "joint torque", session.joint_names, also)
     if not seen.moving:
         raise DataError(
             f"{name}: no joint moves by more than 0.01 rad; record an excitation motion, a pose alone does "
@@ -114,104 +221,67 @@ def prepare(
     unseen = frozen_flags(seen.positions, position.shape).any(axis=1)
     bad: BoolArray = np.asarray(position_flags.any(axis=1)) | seen.stale | unseen
     jumps = [jump.behind for jump in seen.jumps]
-    parts, lost = stretches(times, (position, effort), bad, dt, settings.longest_bridge_s, jumps)
+    parts, lost = stretches(joint.times, (position, effort), bad, joint.dt, settings.longest_bridge_s, jumps)
     if not parts:
         raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
-    windows, periods = _windows(session, times)
+    windows, periods = _windows(session, joint.times)
     grid, period_rows = _row_grid(windows, periods, settings)
-    count, resampled = len(parts), any(part.resampled for part in parts)
-    springs = _stiffness(settings, session.joint_names) if sensed else None
+    springs = _stiffness(settings, names) if joint.sensed else None
     same = session.joint, settings.cutoff, settings.order, settings.outlier_scale, settings.longest_bridge_s
-    wide = partial(recalled, effort_flags, times, settings, springs, recall, same)
-    coupled = settings.coupled_places(session.joint_names)
-    motions = motions_shelved(filtered_motions(parts, wide, settings, coupled, blocks))
+    wide = partial(recalled, effort_flags, joint.times, settings, springs, recall, same)
+    motions = motions_shelved(filtered_motions(parts, wide, settings, settings.coupled_places(names), blocks))
     release(position, effort)
     longest = max(parts, key=lambda part: part.count)
-    excitation = recall.of(partial(excitation_hz, motions, longest, dt, settings.cutoff), *same)
-    flagged = {
-        "stale": int(seen.stale.sum()),
-        "position_outliers": int(position_flags.sum()),
-        "joint_torque_outliers": int((effort_flags & ~stuck)[~kept].sum()),
-        "joint_torque_held": int(kept.sum()),
-        "joint_torque_frozen": int(stuck.sum()),
-        "position_frozen": int(unseen.sum()),
-        "position_jumps": len(set(jumps)),
-    }
-    # A tenth of a gigabyte for an hour.
-    del parts, longest, position_flags, effort_flags, kept, stuck, unseen, bad, times
-    motor_data = (
-        _motor(session, origin, settings, name, warnings, recall)
-        if motor and session.motor is not None
-        else None
-    )
-    if motor_data is not None and clock is not None:
-        motor_data = (clock.at(motor_data[0], stamps), *motor_data[1:])
-    delay = None
-    if motor_data is not None:
-        delay = _delay(motor_data, motions, session.joint_names, settings, springs, sensed)
-        if delay.disagreement > DISAGREEMENT:
-            spread = ", ".join(f"{joint} {1e3 * own:.1f}" for joint, (own, _) in delay.by_joint.items())
-            warnings.append(
-                f"{name}: the joints disagree about the motor channel's delay ({spread} ms), "
-                f"{delay.disagreement:.1f} times beyond their standard deviations; elastic joints do that, "
-                "and the stated deviation of the delay allows for it"
-            )
-        if delay.early:
-            warnings.append(
-                f"{name}: the motor torque looks early by {-1e3 * delay.estimate:.1f} ms, as no channel can be, and "
-                "elastic joints do by one or two at most: the joint torque is late, or the stamps are wrong. It is "
-                "taken as not late; correct the stamps, or state `motor_delay_s`"
-            )
-    passages = _motors_shelved(_passages(motions, grid, windows, motor_data, delay, settings))
-    if not sensed:
-        passages = [replace(p, joint_valid=np.zeros_like(p.joint_valid)) for p in passages]
-    if not passages:
-        said = f"the ends of the position filter, {2.0 * settings.edge:.2f} s"
-        remedy = "raise `cutoff_hz`" if settings.edge_s is None else "lower `edge_s`"
-        if settings.rate_hz is not None and 1.0 / settings.rate_hz > 2.0 * settings.edge:
-            said, remedy = f"the time between two rows, {1.0 / settings.rate_hz:.2f} s", "raise `rate_hz`"
-        raise DataError(f"{name}: no stretch is longer than {said}; record a longer motion or {remedy}")
-    advised = advice(
-        settings,
-        excitation_hz=excitation,
-        joint_rate_hz=1.0 / dt,
-        motor_rate_hz=None if motor_data is None else 1.0 / median_step(motor_data[0]),
-        resonance_hz=resonance_hz,
-    )
-    warnings += advised if advise else ()
-    counts = {
-        "lost": lost,
-        **flagged,
-        "motor_torque_outliers": 0 if motor_data is None else int(motor_data[2].sum()),
-        "stretches": count,
-        "resampled": int(resampled),
-        "rows": sum(len(passage.rows) for passage in passages),
-        "joint_rows_dropped": sum(int((~passage.joint_valid).sum()) for passage in passages),
-        "motor_rows_dropped": sum(
-            int((~passage.motor_valid).sum()) for passage in passages if passage.motor_valid is not None
-        ),
-    }
-    for warning in warnings if log else ():
-        logger.warning("%s", warning)
-    return PreparedSession(
-        name=name,
-        joint_names=session.joint_names,
-        settings=settings,
-        passages=tuple(passages),
-        row_time_s=float(grid[1] - grid[0]) if len(grid) > 1 else 1.0 / settings.row_rate_hz,
-        period_rows=period_rows,
-        periods=len(windows) if period_rows else 0,
-        delay=delay,
-        excitation_hz=excitation,
-        cutoff_hz=settings.cutoff,
+    return _Moved(
+        motions=motions,
+        excitation_hz=recall.of(partial(excitation_hz, motions, longest, joint.dt, settings.cutoff), *same),
         moving=seen.moving,
-        counts=counts,
-        warnings=tuple(warnings),
-        uid=session.metadata.get("uid", ""),
-        mean_torque=_mean_torque(passages) if sensed else (),
-        jitter_s=None if clock is None else clock.jitter_s,
-        joint_delay=_joint_delay(settings) if sensed else None,
+        lost=lost,
+        flagged={
+            "stale": int(seen.stale.sum()),
+            "position_outliers": int(position_flags.sum()),
+            "joint_torque_outliers": int((effort_flags & ~stuck)[~kept].sum()),
+            "joint_torque_held": int(kept.sum()),
+            "joint_torque_frozen": int(stuck.sum()),
+            "position_frozen": int(unseen.sum()),
+            "position_jumps": len(set(jumps)),
+        },
+        stretches=len(parts),
+        resampled=any(part.resampled for part in parts),
+        windows=windows,
+        grid=grid,
+        period_rows=period_rows,
+        warnings=[
+            *_jumping(name, "position", names, crowded),
+            *_jumping(name, "joint torque", names, also),
+        ],
     )
+
+
+def _doubts(delay: Delay, name: str) -> Iterator[str]:
+    """Warnings about the motor channel's delay."""
+    if delay.disagreement > DISAGREEMENT:
+        spread = ", ".join(f"{joint} {1e3 * own:.1f}" for joint, (own, _) in delay.by_joint.items())
+        yield (
+            f"{name}: the joints disagree about the motor channel's delay ({spread} ms), "
+            f"{delay.disagreement:.1f} times beyond their standard deviations; elastic joints do that, "
+            "and the stated deviation of the delay allows for it"
+        )
+    if delay.early:
+        yield (
+            f"{name}: the motor torque looks early by {-1e3 * delay.estimate:.1f} ms, as no channel can be, and "
+            "elastic joints do by one or two at most: the joint torque is late, or the stamps are wrong. It is "
+            "taken as not late; correct the stamps, or state `motor_delay_s`"
+        )
+
+
+def _refuse_short(name: str, settings: SignalSettings) -> NoReturn:
+    """DataError for a session without a stretch of a row."""
+    said = f"the ends of the position filter, {2.0 * settings.edge:.2f} s"
+    remedy = "raise `cutoff_hz`" if settings.edge_s is None else "lower `edge_s`"
+    if settings.rate_hz is not None and 1.0 / settings.rate_hz > 2.0 * settings.edge:
+        said, remedy = f"the time between two rows, {1.0 / settings.rate_hz:.2f} s", "raise `rate_hz`"
+    raise DataError(f"{name}: no stretch is longer than {said}; record a longer motion or {remedy}")
 
 
 @dataclass(frozen=True)
