@@ -16,7 +16,7 @@ import numpy as np
 from fri.errors import LwrError, naming
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import DRIVE, split_name
-from ident.estimation.comparison import compared
+from ident.estimation.estimator_comparison import compared
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.scores import by_side
 from ident.estimation.validate import validate

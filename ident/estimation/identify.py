@@ -431,7 +431,7 @@ def identify(
         settings = known_settings(sessions, chain)
     require(settings, IdentificationSettings, "settings", "make one with `IdentificationSettings(model=2)`")
     if settings.estimator == AUTO:
-        from ident.estimation.choose import choose
+        from ident.estimation.automatic import choose
 
         return choose(sessions, chain, settings, known=known)
     rows = observed(sessions, chain, settings, known=known)

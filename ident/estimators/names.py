@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 AUTO = "auto"
-"""In place of the name of an estimator: the one that predicts best, see `ident.estimation.comparison`."""
+"""In place of the name of an estimator: the one that predicts best, see `ident.estimation.estimator_comparison`."""
 
 SUMMARIES = {
     "ols": "ordinary least squares, for comparison",

@@ -167,7 +167,7 @@ def command(
     status.show("estimating the model")
     with of_file(settings):
         if estimator == AUTO:
-            from ident.estimation.choose import choose
+            from ident.estimation.automatic import choose
 
             found = choose(logs, chain, wanted, tilt=tilt or None)
         elif tilt:

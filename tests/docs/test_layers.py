@@ -17,7 +17,7 @@ PACKAGES = ("fri", "lwr_driver", "ident", "sim_backend", "runner")
 LATE = {
     (
         "ident.estimation.identify",
-        "ident.estimation.choose",
+        "ident.estimation.automatic",
     ): "estimator `auto` identifies with other estimators",
     ("sim_backend.robot", "sim_backend.model_arm"): "an arm without an identified model starts twice as fast",
 }

@@ -23,8 +23,8 @@ from ident.diagnosis.verdict.task import Task
 from ident.dynamics.structure import Side
 from ident.effects import BASE_TILT, SENSOR_GAIN, Column, effects_torque
 from ident.effects.motion import ArmMotion
+from ident.estimation.automatic import choose
 from ident.estimation.choice import Choice
-from ident.estimation.choose import choose
 from ident.estimation.identify import AUTO, Identification, IdentificationSettings, Known
 from ident.model import DynamicModel
 from ident.rows.prepare import clock_ns
@@ -34,7 +34,7 @@ from lwr_driver.session.spool import stored
 Entries = tuple[Mapping[str, Any], ...]
 
 BY_IDENTIFY = (BASE_TILT.cause, SENSOR_GAIN.cause)
-"""Causes that `identify` looks for by itself, see `ident.estimation.choose`."""
+"""Causes that `identify` looks for by itself, see `ident.estimation.automatic`."""
 
 
 def refitted(task: Task, nominal: Nominal, effects: Entries) -> tuple[DynamicModel, Iterator[DynamicModel]]:

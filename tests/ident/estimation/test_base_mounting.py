@@ -10,7 +10,7 @@ import pytest
 from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
-from ident.estimation.choose import choose
+from ident.estimation.automatic import choose
 from ident.estimation.identify import IdentificationSettings, identify
 from ident.estimation.mounting import find_mounting, tilt_columns
 from ident.estimators import nearest_consistent

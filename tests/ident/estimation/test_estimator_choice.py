@@ -11,8 +11,8 @@ import pytest
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
-from ident.estimation.choose import BesideGains, choose
-from ident.estimation.comparison import EstimatorComparison, Kind
+from ident.estimation.automatic import BesideGains, choose
+from ident.estimation.estimator_comparison import EstimatorComparison, Kind
 from ident.estimation.identify import Identification, IdentificationSettings, identify
 from ident.estimation.parts import PARTS, beside, held_back_parts
 from ident.estimators import MaximumAPosteriori, Prior, Problem, RowGroup, WeightedLeastSquares
@@ -126,7 +126,7 @@ def test_a_tilt_is_found_where_it_helps():
 def test_an_earlier_choice_is_taken_for_other_sessions_and_estimates_anew(monkeypatch: pytest.MonkeyPatch):
     first = chosen(kilogrammes=4.0).choice
     assert first is not None
-    monkeypatch.setattr("ident.estimation.choose.compared", None)
+    monkeypatch.setattr("ident.estimation.automatic.compared", None)
     again = choose([session(sensors=SENSORS, motor=False, seed=7)], chain(), MODEL_1, like=first)
     assert again.choice is not None
     assert again.choice.winner == first.winner

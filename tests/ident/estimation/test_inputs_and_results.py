@@ -69,7 +69,7 @@ def test_without_settings_the_result_is_that_of_the_command(
 ) -> None:
     taken = []
     monkeypatch.setattr(
-        "ident.estimation.choose.choose", lambda sessions, chain, settings, **known: taken.append(settings)
+        "ident.estimation.automatic.choose", lambda sessions, chain, settings, **known: taken.append(settings)
     )
     identify(unloaded.path, bench.chain)
     assert taken == [known_settings(unloaded, bench.chain)]

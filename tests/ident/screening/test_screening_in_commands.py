@@ -57,7 +57,7 @@ def screened(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_a_chosen_estimator_screens_once_and_gives_no_advice_on_chosen_cut_offs(
     trio: list[Session], screened: list[int], tilt: bool
 ) -> None:
-    from ident.estimation.choose import choose
+    from ident.estimation.automatic import choose
 
     gain = scaled("joint", "effort", 1.3, "A2")(trio[:1])
     auto = choose(gain, chain(), replace(PLAIN, estimator=AUTO), tilt=tilt)

@@ -1,4 +1,4 @@
-"""The arm identified by the estimator that predicts best (`ident.estimation.comparison`).
+"""The arm identified by the estimator that predicts best (`ident.estimation.estimator_comparison`).
 
 An arm with gains of its sensors is identified from the torques divided by them, and its model states them as effects.
 So it does with friction of the drives that turns over a path after a reversal (`ident.estimation.turning`).
@@ -17,7 +17,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.effects import SENSOR_GAIN, entry_of
 from ident.estimation.choice import Choice
-from ident.estimation.comparison import LOOSEST, PLAIN, compared
+from ident.estimation.estimator_comparison import LOOSEST, PLAIN, compared
 from ident.estimation.identify import (
     EstimatorFactory,
     Identification,
