@@ -23,12 +23,14 @@ from ident.diagnosis.outcome.result import Diagnosis
 from ident.diagnosis.rows.broken_data import (
     BrokenChannel,
     blamed,
+    in_doubt,
     is_broken,
     without_broken,
     worthless,
 )
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.verdict.conclusion import conclude
+from ident.diagnosis.verdict.doubtful_channels import bending, held_back, unconfirmed, without_payloads
 from ident.diagnosis.verdict.late_channels import in_time, late_by_themselves, without_late
 from ident.diagnosis.verdict.payloads import other_masses, payload_finding, unstated_body, with_masses
 from ident.diagnosis.verdict.task import Simulate, State, Task
@@ -36,6 +38,7 @@ from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, PRESLIDING
 from ident.model import Model, as_model
 from ident.rows.sessions import require
+from ident.screening.doubts import Doubt
 from lwr_driver.session import Sessions, as_sessions
 
 # Rounds of the presliding lengths of these days, the factor on one that is none, and the largest one.
@@ -83,13 +86,16 @@ def diagnose(
             return _ended(task, broken)
         whole = task
         task, first = _begun(whole)
-        contradicted = _contradicted(first.bench, reference)
+        contradicted = _contradicted(first.bench, reference, ready.doubts)
+        broken = (*broken, *contradicted)
+        doubts = unconfirmed(ready.doubts, broken, chain.joint_names)
         if contradicted:
-            broken = (*broken, *contradicted)
             whole = replace(whole, recordings=without_broken(recordings, contradicted), sound=False)
             if worthless(broken):
                 return _ended(whole, broken)
-            task, first = _begun(whole)
+        payloads_told = not bending(doubts)
+        if contradicted or not payloads_told:
+            task, first = _begun(whole if payloads_told else without_payloads(whole))
         others = other_masses(first.bench, reference)
         body = None if reference is None else unstated_body(first.bench, reference)
         if reference is not None and (others or body is not None):
@@ -100,14 +106,14 @@ def diagnose(
             first = _first(task, _bench(task))
         state = _refined(task, in_time(task, first))
         state = replace(state, notes=(*state.notes, *late_by_themselves(task.apart, state)))
-        if reference is not None:
+        if reference is not None and payloads_told:
             loads = [payload_finding(one) for one in (*others, body) if one is not None]
             state = replace(state, loads=tuple(loads))
         else:
             state = replace(state, notes=(*state.notes, *(one.text for one in others)))
-        found = conclude(task, state)
+        found = held_back(conclude(task, state), doubts, chain.joint_names)
         nameless = tuple(u for u in found.unexplained if not is_broken(broken, u.side, u.joint))
-        return replace(found, unexplained=nameless, data=broken)
+        return replace(found, unexplained=nameless, data=broken, in_doubt=in_doubt(doubts, chain))
 
 
 def _ended(task: Task, broken: Sequence[BrokenChannel]) -> Diagnosis:
@@ -117,12 +123,14 @@ def _ended(task: Task, broken: Sequence[BrokenChannel]) -> Diagnosis:
     return replace(conclude(task, state), findings=(), unexplained=(), data=tuple(broken))
 
 
-def _contradicted(bench: DiagnosisBench, reference: Reference | None) -> tuple[BrokenChannel, ...]:
-    """The torque channels that the healthy arm contradicts; none without one."""
+def _contradicted(
+    bench: DiagnosisBench, reference: Reference | None, doubts: Sequence[Doubt]
+) -> tuple[BrokenChannel, ...]:
+    """The torque channels that the healthy arm contradicts; none without one. doubts : see `against_healthy`."""
     healthy = None if reference is None else reference.prior(bench.nominal.base, bench.nominal.masses)
     if healthy is None:
         return ()
-    return against_healthy(bench.nominal.rows, healthy[1], bench.nominal.arm.chain.joint_names)
+    return against_healthy(bench.nominal.rows, healthy[1], bench.nominal.arm.chain.joint_names, doubts)
 
 
 def _bench(task: Task) -> DiagnosisBench:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from fri.errors import DataError
 from lwr_driver.session import JointColumns, Session
@@ -20,13 +21,18 @@ MEND_POSITION = (
 )
 
 
+DoubtKind = Literal["", "gain", "zero", "drift", "saturation"]
+
+
 @dataclass(frozen=True)
 class Doubt:
     """One sentence about one channel of one session or of all.
 
     channel : "position", "velocity", "joint torque", "motor torque", "time", "payload", "log", "spike", "kinematics".
     joints : names; empty for the channel as a whole. session : file name; empty for all sessions.
-    certain : whether the data are worthless with it. lost : whether the channel holds nothing, and the rows do without.
+    certain : whether the data are worthless with it. lost : whether the channel holds nothing of use, and the rows do
+    without it. kind : "gain", "zero" or "drift" of a torque, "saturation" of one, whose samples at the level are left
+    out.
     """
 
     channel: str
@@ -37,6 +43,7 @@ class Doubt:
     certain: bool = False
     session: str = ""
     lost: bool = False
+    kind: DoubtKind = ""
 
     @property
     def subject(self) -> str:

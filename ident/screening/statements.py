@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ident.rows.sessions import payload_name
-from ident.screening.doubts import MEND_POSITION, Doubt
+from ident.screening.doubts import MEND_POSITION, Doubt, DoubtKind
 from ident.screening.explanations import CERTAIN, Explanation
 from ident.screening.normal_equations import Part
 from lwr_driver.session import Session
@@ -76,7 +76,14 @@ def doubt_of(one: Explanation, sessions: Sequence[Session]) -> Doubt:
     else:
         seen = f"contradicts the other channels; {fall}"
         mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
-    return Doubt(channel, joints, seen, looks_like, mend, certain, session)
+    return Doubt(channel, joints, seen, looks_like, mend, certain, session, kind=_kind(one))
+
+
+def _kind(one: Explanation) -> DoubtKind:
+    """Kind of a doubt about a torque."""
+    if one.error is not None:
+        return one.error.kind
+    return "gain" if one.gain is not None else ""
 
 
 def _of_part(one: Explanation, sessions: Sequence[Session]) -> tuple[str, str, bool]:

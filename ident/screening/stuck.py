@@ -228,29 +228,31 @@ def saturated(session: Session, units: Mapping[str, str]) -> Iterator[Doubt]:
         for joint, level in enumerate(clipped_at(session.joint)):
             if np.isfinite(level) and joint not in silent:
                 seen = f"stays at its largest value, {level:.4g} {by_joint[joint]}, again and again"
-                yield Doubt(
-                    "joint torque", (session.joint_names[joint],), seen, "saturation", mend, False, name
-                )
+                where = (session.joint_names[joint],)
+                yield Doubt("joint torque", where, seen, "saturation", mend, session=name, kind="saturation")
     if session.motor is not None and session.motor.effort.size:
         silent = set(dead(session.motor))
         levels: dict[int, list[str]] = {}
+        clipped = dict[int, float]()
         for stuck in stuck_at(session.motor, session.joint):
             own, share = session.motor.effort[:, stuck.joint], stuck.count / max(stuck.samples, 1)
             # A coarse sensor may repeat a value somewhere in its range; a limit is the end of the range.
-            if stuck.joint not in silent and (share > _OFTEN or stuck.value in (own.min(), own.max())):
+            limit = stuck.value in (own.min(), own.max())
+            if stuck.joint not in silent and (share > _OFTEN or limit):
+                clipped[stuck.joint] = clipped.get(stuck.joint, 0.0) + share * limit
                 levels.setdefault(stuck.joint, []).append(
                     f"{stuck.value:.4g} {by_joint[stuck.joint]} ({100 * share:.0f} % of the motion)"
                 )
         for joint, texts in levels.items():
-            seen = f"stays at {' and '.join(texts)}"
             yield Doubt(
                 "motor torque",
                 (session.joint_names[joint],),
-                seen,
-                "saturation or a dead zone",
+                f"stays at {' and '.join(texts)}",
+                "saturation" if clipped[joint] > 0.0 else "saturation or a dead zone",
                 mend,
-                False,
-                name,
+                session=name,
+                lost=clipped[joint] > _OFTEN,
+                kind="saturation",
             )
     for joint, level in _flat_tops(session.joint):
         seen = f"stops abruptly at {level:.4g} again and again"

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 # A column with less than this share of its power beside the base carries no information of its own.
 _LEAST_LEFT = 1e-5
+# Size of a column over the largest one below which it is rounding: some hundred operations of double precision leave
+# 1e-14, and SI units of an arm's parameters differ by less than 1e9.
+_ROUNDING = 1e-12
 
 Key = tuple[str, int]
 Rows = Mapping[Key, Floats]
@@ -70,8 +73,8 @@ def width_of(rows: Rows) -> int:
 
 
 def scale_of(squares: Floats) -> Floats:
-    """Factors (P,) to a diagonal of ones from its squares (P,), 0 for a column without any."""
-    some = squares > 0.0
+    """Factors (P,) to a diagonal of ones from its squares (P,), 0 for a column of nothing but rounding."""
+    some = squares > _ROUNDING**2 * np.max(squares, initial=0.0)
     return np.where(some, 1.0 / np.sqrt(np.where(some, squares, 1.0)), 0.0)
 
 

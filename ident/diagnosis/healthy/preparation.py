@@ -6,24 +6,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ident.diagnosis.healthy.reference import Reference
-from ident.diagnosis.rows.broken_data import BrokenChannel, blamed, broken_channels, without_broken
+from ident.diagnosis.rows.broken_data import BrokenChannel, blamed, screened, without_broken
 from ident.diagnosis.rows.recording import SessionRecord, record, settled, some_joint_moves
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling
 from ident.model.signals import signal_settings
 from ident.rows.content import Recall
+from ident.screening.doubts import Doubt
 from lwr_driver.session import Session
 
 
 @dataclass(frozen=True, eq=False)
 class Preparation:
     """Records of all sessions in the order of their beginnings, without the channels that are broken, and the settings
-    with the signals that they were filtered with."""
+    with the signals that they were filtered with. doubts : not certain, of channels that stay."""
 
     settings: DiagnosisSettings
     recordings: tuple[SessionRecord, ...]
     broken: tuple[BrokenChannel, ...]
+    doubts: tuple[Doubt, ...] = ()
 
 
 def preparation(
@@ -41,10 +43,10 @@ def preparation(
     sessions.
     """
     everything, held = sorted([*sessions, *test], key=lambda s: s.start), {id(s) for s in test}
-    recall = Recall()
+    recall, doubts = Recall(), tuple[Doubt, ...]()
     if broken is None:
         # As `identify` does, whatever a reference filters with.
-        broken = broken_channels(everything, chain, settings.signals, couplings, recall=recall)
+        broken, doubts = screened(everything, chain, settings.signals, couplings, recall=recall)
     known = None if reference is None else signal_settings(reference.model)
     if known is not None:
         # Of the reference's sessions, not of these.
@@ -56,4 +58,4 @@ def preparation(
             record(s, k, chain, settings, test=id(s) in held, recall=recall) for k, s in enumerate(everything)
         )
         some_joint_moves(recordings)
-        return Preparation(settings, without_broken(recordings, broken), tuple(broken))
+        return Preparation(settings, without_broken(recordings, broken), tuple(broken), doubts)

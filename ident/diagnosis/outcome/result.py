@@ -215,7 +215,8 @@ class Diagnosis(Tabular):
     torque_base, torque_extended : errors of the models in the test sessions with all samples, None without any.
     torque_present : the same of the present model, None without one.
     referenced : against a healthy arm. numbered : names of all sessions, in the order of their numbers.
-    notes : sentences on limits of the data. data : broken channels, left out.
+    notes : sentences on limits of the data. data : broken channels, left out. in_doubt : channels that may
+    be broken, with rows that stay; no cause beside them is sure.
     residuals : held-out residual (m, n) [Nm] by model (`base`, `extended`) and side, NaN in unused rows.
     states : of the arm in these rows, by side.
     """
@@ -245,6 +246,7 @@ class Diagnosis(Tabular):
     referenced: bool = False
     numbered: tuple[str, ...] = ()
     data: tuple[BrokenChannel, ...] = ()
+    in_doubt: tuple[BrokenChannel, ...] = ()
     healthy: tuple[Mapping[str, Any], ...] = ()
     healthy_left: Mapping[str, Floats] = field(default_factory=dict)
     torque_base: TorqueErrors | None = None
@@ -317,6 +319,7 @@ class Diagnosis(Tabular):
                 "simulation_error": base,
             },
             "data": [broken.to_dict() for broken in self.data],
+            "in_doubt": [one.to_dict() for one in self.in_doubt],
             "findings": [finding.to_dict() for finding in self.findings],
             "character": [finding.to_dict() for finding in self.character],
             "healthy": [

@@ -297,6 +297,8 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
     if count:
         doubtful = f", {'one' if len(doubts) == 1 else len(doubts)} of them {doubt}"
         return "look", f"{count} causes found, the largest effect first" + (doubtful if doubts else "")
+    if content.get("in_doubt"):
+        return "look", "No cause found, but channels of these data are in doubt: check them first"
     if content.get("character"):
         return "good", "No cause found beyond the character of such an arm, which the extended model now has"
     rest = [*content.get("nameless", []), *content.get("unexplained", [])]
@@ -335,12 +337,16 @@ def _lines(
     names: Sequence[str],
 ) -> list[Line]:
     found = []
-    if content.get("data"):
+    for subject, key, anchor in (
+        ("broken channels", "data", "data"),
+        ("channels in doubt", "in_doubt", "limits"),
+    ):
         listed = [
-            f"{_name(d['joint'], names) if d.get('joint') else ''} {d['channel']}" for d in content["data"]
+            f"{_name(d['joint'], names) if d.get('joint') else ''} {d['channel']}"
+            for d in content.get(key, ())
         ]
         text = ", ".join(dict.fromkeys(one.strip() for one in listed))
-        found.append(Line("broken channels", text, "none", "look", "data"))
+        found += [Line(subject, text, "none", "look", anchor)] * bool(text)
     for finding in findings:
         parts = [finding.text, *(f"{label} {text}" for label, text in finding.facts[:1]), finding.confidence]
         text = "; ".join(part.rstrip(".") for part in parts if part)

@@ -1,9 +1,9 @@
 """Channels that cannot be what they say: told first, left out of the rows, and no cause is named from them.
 
-Dead and frozen torques, and a turned or mis-scaled torque of one joint, are left out alone: the rows of the other
-joints and of the other side stay. A wrong position, a wrong clock, or such torques of several joints put the log as a
-whole in doubt, and the diagnosis ends with them. What is wrong by some percent is no broken channel but a cause of the
-catalogue.
+Dead, frozen and clipped torques, and a turned or mis-scaled torque of one joint, are left out alone: the rows of the
+other joints and of the other side stay. A wrong position, a wrong clock, or such torques of several joints put the log
+as a whole in doubt, and the diagnosis ends with them. What is wrong by some percent is no broken channel but a cause of
+the catalogue. A doubt that nothing confirms leaves the rows as they are, and no cause in them is sure.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from ident.screening.stuck import asked_to_move
 from lwr_driver.session import Session
 
 _TORQUES = ("joint torque", "motor torque")
+# Channels whose error bends all rows.
+_BENDING = ("position", "time", "payload", "mounting", "kinematics", "motor torque against joint torque")
 
 
 @dataclass(frozen=True)
@@ -60,19 +62,49 @@ def broken_channels(
     *,
     recall: Recall | None = None,
 ) -> tuple[BrokenChannel, ...]:
-    """The channels of the sessions that `ident.screening` is certain about, and dead ones.
+    """The channels of the sessions that `ident.screening` is certain about, and dead or clipped ones.
 
     recall : as for `prepare`.
     """
-    found = []
+    return screened(sessions, chain, signals, couplings, recall=recall)[0]
+
+
+def screened(
+    sessions: Sequence[Session],
+    chain: Chain,
+    signals: SignalSettings,
+    couplings: Sequence[Coupling] = (),
+    *,
+    recall: Recall | None = None,
+) -> tuple[tuple[BrokenChannel, ...], tuple[Doubt, ...]]:
+    """The broken channels, and the doubts that are not certain about torques, positions and the log as a whole.
+
+    Other zeros of a torque and their drift are none: the catalogue has them, and the healthy arm from day to day.
+    """
+    found, doubts = list[BrokenChannel](), list[Doubt]()
     chosen = [session.select(chain.joint_names) for session in sessions]
     for doubt in screen(chosen, chain, signals, couplings, recall=recall):
-        if (doubt.certain or doubt.lost) and not _stands(doubt, chosen):
-            what = f"{doubt.seen}, looks like {doubt.looks_like}" if doubt.looks_like else doubt.seen
-            joints: list[int | None] = [chain.joint_names.index(name) + 1 for name in doubt.joints]
-            for joint in joints or [None]:
-                found.append(BrokenChannel(doubt.channel, joint, what, doubt.mend, doubt.session, doubt.lost))
-    return tuple(found)
+        if _stands(doubt, chosen):
+            continue
+        if doubt.certain or doubt.lost:
+            found += _by_joint(doubt, chain)
+        elif doubt.channel in (*_TORQUES, *_BENDING) and doubt.kind not in ("zero", "drift"):
+            doubts.append(doubt)
+    return tuple(found), tuple(doubts)
+
+
+def in_doubt(doubts: Sequence[Doubt], chain: Chain) -> tuple[BrokenChannel, ...]:
+    """The channels that doubts are about, as those of `data` are told."""
+    return tuple(one for doubt in doubts for one in _by_joint(doubt, chain))
+
+
+def _by_joint(doubt: Doubt, chain: Chain) -> list[BrokenChannel]:
+    what = f"{doubt.seen}, looks like {doubt.looks_like}" if doubt.looks_like else doubt.seen
+    joints: list[int | None] = [chain.joint_names.index(name) + 1 for name in doubt.joints]
+    return [
+        BrokenChannel(doubt.channel, joint, what, doubt.mend, doubt.session, doubt.lost)
+        for joint in joints or [None]
+    ]
 
 
 def _stands(doubt: Doubt, sessions: Sequence[Session]) -> bool:

@@ -21,8 +21,10 @@ from ident.diagnosis.verdict.findings import finding_of, timing_finding
 from ident.diagnosis.verdict.task import State, Task
 from ident.estimators.estimate import fisher_tail
 
-# Largest confidence in a claim that the held-out rows do not show plainly, and its least gain over the usual one.
-_OPEN, _TO_SPARE = 0.7, 2.0
+OPEN = 0.7
+"""Largest confidence in a claim that the held-out rows do not show plainly."""
+# Its least gain over the usual one.
+_TO_SPARE = 2.0
 # Lowest tolerated lower bound of the held-out gain, as a share of its upper bound; with hardly any excitation in the
 # held-out sessions the lowest upper bound, as a share of the claim's gain.
 _ALL_BUT = 0.05
@@ -77,7 +79,7 @@ def confirmed(task: Task, state: State) -> tuple[list[Confirmed], list[Finding]]
             continue
         untested = _untested(claim) or hardly
         grounds = _grounds(claim, claims, finding, bench, without, after, fallen, untested, seed)
-        most = 1.0 if _plain(claim, finding, bench, grounds, fallen) else _OPEN
+        most = 1.0 if _plain(claim, finding, bench, grounds, fallen) else OPEN
         kept.append(Confirmed(claim, finding, grounds, most))
     return kept, refuted
 
@@ -105,7 +107,7 @@ def doubted(
         like = claim.trial.passing and bool(unnamed & mine)
         strange = not _familiar(claim, bench)
         open_ = like or strange or grounds.replaceable > _REPLACEABLE or _bent(claim, remainders)
-        most = min(one.most, claim.confidence, _OPEN if open_ else 1.0)
+        most = min(one.most, claim.confidence, OPEN if open_ else 1.0)
         findings.append(
             replace(one.finding, confidence=min(most, probability(grounds)), grounds=grounds.to_dict())
         )
@@ -137,7 +139,7 @@ def _bent(claim: Claim, remainders: Sequence[Remainder]) -> bool:
 def contradicted(finding: Finding) -> Finding:
     """The finding with the confidence left where its torque raises the torque error of held-out sessions."""
     grounds = {**finding.grounds, "worse": 1.0}
-    confidence = min(finding.confidence, _OPEN, probability(Grounds(**grounds)))
+    confidence = min(finding.confidence, OPEN, probability(Grounds(**grounds)))
     return replace(finding, confidence=confidence, grounds=grounds)
 
 
@@ -165,7 +167,7 @@ def confirmed_delay(
     )
     low, high = finding.evidence.gain_interval_95
     grounds = _grounds(claim, selection.claims, finding, bench, before, now, (low, high), False, seed)
-    confidence = min(claim.confidence, probability(grounds), 1.0 if _seen(low, grounds) else _OPEN)
+    confidence = min(claim.confidence, probability(grounds), 1.0 if _seen(low, grounds) else OPEN)
     return replace(finding, confidence=confidence, grounds=grounds.to_dict())
 
 

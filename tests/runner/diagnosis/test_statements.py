@@ -246,3 +246,12 @@ def test_a_moment_is_told_with_the_name_of_its_session() -> None:
     }
     said = statements(CONTENT | {"findings": [contact]}, details(sessions=["late.mcap", "early.mcap"]), NAMES)
     assert "of early.mcap" in said.text()
+
+
+def test_channels_in_doubt_are_in_the_short_text() -> None:
+    doubts = [{"channel": "motor torque", "joint": joint, "what": "", "advice": ""} for joint in (1, 3, 3)]
+    content = {**CONTENT, "findings": [], "in_doubt": doubts}
+    said = statements(content, details(), NAMES)
+    line = next(one for one in said.lines if one.subject == "channels in doubt")
+    assert line.found == "A1 motor torque, E1 motor torque"
+    assert line.level == said.level == "look"

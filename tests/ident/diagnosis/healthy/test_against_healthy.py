@@ -9,6 +9,7 @@ import pytest
 
 from ident.diagnosis.healthy.against_healthy import against_healthy
 from ident.diagnosis.rows.nominal import SideRows
+from ident.screening.doubts import Doubt
 
 NAMES = ("A1", "A2", "A3")
 VALUES = np.array([2.0, -1.0, 0.5])
@@ -55,5 +56,26 @@ def test_interchanged_torques_are_told_with_both_joints(rows: SideRows) -> None:
     words = [one.what for one in against_healthy({"joint": swapped}, VALUES, NAMES)]
     assert "healthy arm's torque of A3" in words[0]
     assert "healthy arm's torque of A1" in words[1]
+    # Currents come with the constant of the other drive.
+    constants = swapped.target * [1.7, 1.0, 1.0 / 1.7]
+    assert told(replace(rows, target=constants)) == [("motor torque", 1), ("motor torque", 3)]
     # A copy of another torque is no interchange.
     assert told(replace(rows, target=rows.target[:, [2, 1, 2]])) == []
+
+
+def test_a_gain_that_the_other_channels_say_too_is_told(rows: SideRows) -> None:
+    """A payload scales the torque of a light joint alike, and is no broken channel."""
+    twice = {"motor": replace(rows, target=rows.target * [1.0, 2.0, 1.0])}
+    doubt = Doubt("motor torque", ("A2",), "is 1.8 times the others", "a gain of 1.8", "", kind="gain")
+    assert against_healthy(twice, VALUES, NAMES) == ()
+    (found,) = against_healthy(twice, VALUES, NAMES, [doubt])
+    assert (found.channel, found.joint) == ("motor torque", 2)
+    assert "is 2.09 times the healthy arm's torque" in found.what
+    # Another joint, another kind, or a gain that the healthy arm does not show.
+    for other in (
+        replace(doubt, joints=("A1",)),
+        replace(doubt, kind=""),
+        replace(doubt, channel="position"),
+    ):
+        assert against_healthy(twice, VALUES, NAMES, [other]) == ()
+    assert against_healthy({"motor": rows}, VALUES, NAMES, [doubt]) == ()

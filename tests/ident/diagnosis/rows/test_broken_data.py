@@ -12,7 +12,7 @@ import pytest
 
 from fri.errors import DataError
 from ident.diagnosis import commission, diagnose
-from ident.diagnosis.rows.broken_data import blamed, broken_channels
+from ident.diagnosis.rows.broken_data import blamed, broken_channels, in_doubt, screened, worthless
 from ident.dynamics.kinematics import Chain
 from ident.model.model_file import read_model, write_model
 from ident.rows.filters import SignalSettings
@@ -140,6 +140,45 @@ def test_some_percent_are_no_broken_channel(make: Make, chain: Chain) -> None:
 
     sessions = [make("a.mcap", 1, worn), make("b.mcap", 2, worn, 1)]
     assert broken_channels(sessions, chain, SignalSettings()) == ()
+
+
+def clipped(share: float) -> Edit:
+    """Cuts the largest torques of the second joint off, that share of the samples."""
+
+    def edit(values: np.ndarray) -> None:
+        np.minimum(values[:, 1], np.quantile(values[:, 1], 1.0 - share), out=values[:, 1])
+
+    return edit
+
+
+def test_a_motor_torque_clipped_in_much_of_the_motion_is_left_out(pair: list[Session], chain: Chain) -> None:
+    bad, doubts = screened(edited(pair, "motor", "effort", clipped(0.2)), chain, SignalSettings())
+    assert [(one.channel, one.joint, one.session, one.lost) for one in bad] == [
+        ("motor torque", 2, name, True) for name in ("a.mcap", "b.mcap")
+    ]
+    assert all("% of the motion), looks like saturation" in one.what for one in bad)
+    assert not worthless(bad)
+    assert doubts == ()
+    # Of a few samples these alone are left out; it is told.
+    bad, doubts = screened(edited(pair, "motor", "effort", clipped(0.02)), chain, SignalSettings())
+    assert bad == ()
+    assert {(one.channel, one.joints, one.kind) for one in doubts} == {
+        ("motor torque", ("two",), "saturation")
+    }
+    told = in_doubt(doubts, chain)
+    assert {(one.channel, one.joint, one.session) for one in told} == {
+        ("motor torque", 2, name) for name in ("a.mcap", "b.mcap")
+    }
+
+
+def test_a_clipped_motor_torque_alone_on_its_side_is_data(pair: list[Session], chain: Chain) -> None:
+    """No row of the joint is left, and its parameters are in columns of rounding errors."""
+    empty = np.zeros((len(pair[0].joint), 0))
+    motors = [replace(one, joint=replace(one.joint, effort=empty)) for one in pair]
+    found = diagnose(edited(motors, "motor", "effort", clipped(0.2)), chain)
+    assert {(one.channel, one.joint) for one in found.data} == {("motor torque", 2)}
+    assert found.unexplained == ()
+    assert np.all(np.isfinite(found.extended_model.values))
 
 
 def test_an_error_of_the_fit_is_blamed_on_the_broken_channel(pair: list[Session], chain: Chain) -> None:
