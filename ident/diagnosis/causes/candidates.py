@@ -388,6 +388,10 @@ class Dictionary:
                 return self.measure(candidate, rows, known)
         return None
 
+    def shape(self, candidate: Candidate, text: str) -> Shape | None:
+        """The shape of the grid with this text; None without it."""
+        return next((one for one, *_ in self._kept.get(candidate.key, ()) if repr(one) == text), None)
+
     def nearest(self, trial: Trial) -> str:
         """The shape of the grid nearest to a trial's, empty without one."""
         shapes = [shape for shape, *_ in self._kept.get(trial.candidate.key, ())]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from ident.diagnosis.causes.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.causes.tolerances import HABITUAL, usual_change
-from ident.diagnosis.causes.usual_sizes import Healthy, UsualSize
+from ident.diagnosis.causes.usual_sizes import Healthy, Key, UsualSize
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import Shape
@@ -16,6 +16,8 @@ from ident.effects import Shape
 # Least and largest ratio of the information to that of the healthy sets: less of it makes no limit smaller, for what
 # the model lacks differs from motion to motion, too.
 _INFORMATION = (1.0, 25.0)
+# Least number of other joints that tell the state of a day.
+_OTHERS = 2
 # Largest share of a trial's gain that its shape has more than the nearest one of the grid, of the same size otherwise.
 _OF_SHAPE = 0.1
 
@@ -41,23 +43,51 @@ def _is_step(trial: Trial) -> bool:
     return trial.shape.form in effect.onsets and not effect.event
 
 
+def _of_the_day(trial: Trial) -> bool:
+    """Whether a trial follows from the state of a day in all joints on a healthy arm, such as its warmth: a drift with
+    it, or any step between sessions."""
+    effect = trial.candidate.effect
+    return effect.together or effect.mode(trial.shape) == "between"
+
+
 class HealthyNull:
     """The gains of candidates that a healthy arm reaches in the present sessions."""
 
     def __init__(self, dictionary: Dictionary, settings: DiagnosisSettings, healthy: Healthy) -> None:
         self.dictionary, self.settings, self.healthy = dictionary, settings, healthy
+        self._present: dict[Key, float] = {}
+
+    def meet(self, found: Sequence[Trial]) -> None:
+        """Takes the state of the day from the best trials of all candidates before any claim: their gains over the
+        means of the healthy sets, as much as the motions of either show."""
+        for trial in found:
+            key = trial.candidate.key
+            days = self.healthy.days.get(key)
+            if days is not None and days.mean > 0.0:
+                usual = days.mean * self._shown_more(trial.candidate, self.dictionary.nearest(trial))
+                self._present[key] = trial.score.gain / usual
+
+    def _state(self, key: Key) -> float:
+        """Square of the state of the day in units of that on the days of the healthy sets, at least 1: the median over
+        the other joints, which a fault of one of them leaves alone; infinite where they are too few to tell."""
+        cause, joint = key
+        others = [one for (name, at), one in self._present.items() if name == cause and at != joint]
+        return max(1.0, float(np.median(others))) if len(others) >= _OTHERS else np.inf
 
     def limit(self, trial: Trial) -> float:
         """Upper limit of the gain of such a trial on a healthy arm; 0 for a step, see `exceeded`."""
         if _is_step(trial):
             return 0.0
-        limit = self.healthy.limits.get(trial.candidate.key, 0.0)
+        key = trial.candidate.key
+        limit, days = self.healthy.limits.get(key, 0.0), self.healthy.days.get(key)
+        if days is not None and days.mean > 0.0 and _of_the_day(trial):
+            limit = min(days.by_days, self._state(key) * days.by_joints)
         return self._in_these(trial.candidate, limit, self.dictionary.nearest(trial), trial.score)
 
     def exceeded(self, trial: Trial) -> bool:
         """Whether a trial is more than on a healthy arm: its difference from the usual size. Its gain alone suffices
-        where the healthy sets have no clear size. A step has to be more than a drift in its place: that of a healthy
-        arm has a gain as a step, too.
+        where the healthy sets have no clear size, and for a change between sessions, which has none: it is that of the
+        day's state. A step has to be more than a drift in its place: that of a healthy arm has a gain as a step, too.
         """
         candidate = trial.candidate
         if _is_step(trial):
@@ -71,7 +101,7 @@ class HealthyNull:
         size, limit = usual
         if self._is_known(trial, size, here):
             return False
-        if here is None:
+        if here is None or self._between(trial, size):
             return more
         change = size.beyond(here)
         other = trial.score.gain - max(here.gain, 0.0)
@@ -80,6 +110,13 @@ class HealthyNull:
         changed = change > 0.0 and change + other > limit
         scatter = self._in_these(candidate, size.scatter, size.shape, here)
         return changed or (more and not size.clear(here, scatter))
+
+    def _between(self, trial: Trial, size: UsualSize) -> bool:
+        """Whether a trial or the usual size is a change between sessions."""
+        effect = trial.candidate.effect
+        usual = self.dictionary.shape(trial.candidate, size.shape) if effect.mode(trial.shape) else None
+        shapes = [trial.shape, *([] if usual is None else [usual])]
+        return any(effect.mode(shape) == "between" for shape in shapes)
 
     def _is_known(self, trial: Trial, size: UsualSize, usual: Score | None) -> bool:
         """Whether a trial is a size that the healthy sets have as well, however little they show of it. usual : its
@@ -107,12 +144,13 @@ class HealthyNull:
         Few healthy days may be alike by chance, so it is no less than that of the usual change of a scale.
         """
         least = self._scaled(candidate, score)
+        return max(limit * self._shown_more(candidate, shape), least) if limit else least
+
+    def _shown_more(self, candidate: Candidate, shape: str) -> float:
+        """Information of these sessions on a shape over that of the healthy sets, within limits; 1 if unknown."""
         shown, here = self.healthy.shown.get(candidate.key, {}), self.dictionary.information(candidate)
         before = shown.get(_counterpart(shape, here, shown), 0.0)
-        if not limit or before <= 0.0:
-            return max(limit, least)
-        now = here.get(shape, 0.0)
-        return max(limit * float(np.clip(now / before, *_INFORMATION)), least)
+        return float(np.clip(here.get(shape, 0.0) / before, *_INFORMATION)) if before > 0.0 else 1.0
 
     def _scaled(self, candidate: Candidate, score: Score) -> float:
         """Gain by the largest usual change from day to day of a cause that is a scale, 0 for others and without a

@@ -58,7 +58,9 @@ def select(dictionary: Dictionary, settings: DiagnosisSettings, healthy: Healthy
     accepted: list[Trial] = []
     for _ in range(settings.rounds):
         found = contest.contenders(accepted)
-        first = first or {t.candidate.key: max(t.score.gain, 0.0) for t in found}
+        if not first:
+            first = {t.candidate.key: max(t.score.gain, 0.0) for t in found}
+            contest.null.meet(found)
         while contest.habit(found):
             found = contest.contenders(accepted)
         best = contest.next(accepted, [t for t in found if contest.enough.carried(t)])

@@ -24,12 +24,13 @@ from ident.estimators.estimate import fisher_limit
 
 # Least square of a size over its variance, for each of its coefficients, for one other than zero.
 _THERE = 9.0
-# Least number of sets for a limit.
-_LEAST_SETS = 2
 # Largest change of a size from day to day as a share of it: three standard deviations of friction's.
 _LARGEST_SHARE = 0.3
 # The same in standard deviations.
 _LARGEST = 3.0
+
+LEAST_SETS = 2
+"""Least number of sets for a limit."""
 
 _Any = TypeVar("_Any")
 Key = tuple[str, int]
@@ -135,14 +136,27 @@ class UsualSize:
         return factor * float(size @ inverse @ size)
 
 
+@dataclass(frozen=True)
+class OfDays:
+    """Gain of a cause that follows from one state of a day in all joints. mean : over the healthy sets, beyond noise.
+    by_joints : upper limit in a further set where each joint's gain is an observation of its own, so in a state as on
+    the days of the sets. by_days : the same from the few days alone, in any state."""
+
+    mean: float
+    by_joints: float
+    by_days: float
+
+
 @dataclass(frozen=True, eq=False)
 class Healthy:
     """What healthy sets say of the candidates. limits : upper limit of the gain in a healthy set. shown : mean
-    information, by shape of the grid. sizes : usual size, and the upper limit of the gain of a difference from it."""
+    information, by shape of the grid. sizes : usual size, and the upper limit of the gain of a difference from it.
+    days : of what may follow from the state of a day."""
 
     limits: Mapping[Key, float] = field(default_factory=dict)
     shown: Mapping[Key, Mapping[str, float]] = field(default_factory=dict)
     sizes: Mapping[Key, tuple[UsualSize, float]] = field(default_factory=dict)
+    days: Mapping[Key, OfDays] = field(default_factory=dict)
 
     def without(self, causes: Collection[str]) -> Healthy:
         """The same, saying nothing of these causes."""
@@ -150,7 +164,7 @@ class Healthy:
         def others(table: Mapping[Key, _Any]) -> dict[Key, _Any]:
             return {key: value for key, value in table.items() if key[0] not in causes}
 
-        return Healthy(others(self.limits), others(self.shown), others(self.sizes))
+        return Healthy(others(self.limits), others(self.shown), others(self.sizes), others(self.days))
 
 
 def scores(dictionary: Dictionary) -> Table:
@@ -209,7 +223,7 @@ def _coefficients(content: Any) -> Floats:
 def independent(key: Key, own: float, with_joints: float) -> float:
     """Number of independent sets behind a mean: with those that the other joints count for, unless all joints of an
     arm have the cause from one state of a day; two at least, since a limit from one is none."""
-    return max(own, _LEAST_SETS) if find_effect(key[0]).together else with_joints
+    return max(own, LEAST_SETS) if find_effect(key[0]).together else with_joints
 
 
 def scatter_limits(

@@ -18,12 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
-from ident.diagnosis.causes.usual_sizes import Healthy, UsualSize, independent, scatter_limits
+from ident.diagnosis.causes.usual_sizes import (
+    LEAST_SETS,
+    Healthy,
+    OfDays,
+    UsualSize,
+    scatter_limits,
+)
 from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.rows.nominal_arm import GAIN_STD
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import LINK_FRICTION, PER_LINK, split_name
-from ident.effects import EFFECTS, EncoderSide
+from ident.effects import EFFECTS, EncoderSide, find_effect
 from ident.estimators.estimate import fisher_limit
 from ident.model import DynamicModel, write_model
 
@@ -230,9 +236,8 @@ class Reference:
         """Upper 1 % limits of the gain of each candidate in a healthy set, and of its difference from the usual
         size."""
         changes = scatter_limits(self.usual, self.sets, _ONE_IN, _AS_SETS)
-        return Healthy(
-            self.limits(), self.shown, {key: (size, changes[key]) for key, size in self.usual.items()}
-        )
+        sizes = {key: (size, changes[key]) for key, size in self.usual.items()}
+        return Healthy(self.limits(), self.shown, sizes, self.days())
 
     def limits(self) -> dict[tuple[str, int], float]:
         """Upper 1 % limit of each candidate's gain in a healthy set, by (cause, joint from 0).
@@ -245,6 +250,20 @@ class Reference:
         1 - 1/n^2 of that in square. A function of many knots is one deviation, too: what a healthy arm leaves has a
         form.
         """
+        found = {
+            key: one.by_days if find_effect(key[0]).together else one.by_joints
+            for key, one in self.days().items()
+        }
+        # On a healthy arm a cause reaches at least the gain of its special cases, and is not counted beside them.
+        for effect in EFFECTS.values():
+            for case in effect.contains:
+                for (cause, joint), limit in list(found.items()):
+                    if cause == case:
+                        found[effect.cause, joint] = max(limit, found.get((effect.cause, joint), 0.0))
+        return found
+
+    def days(self) -> dict[tuple[str, int], OfDays]:
+        """The same from the sets and all joints, and from the sets alone, see `limits`."""
         if not self.sets:
             return {}
         further = 1.0 - self.sets**-2.0 if self.sets > 1 else 1.0
@@ -254,17 +273,14 @@ class Reference:
         # The gain from noise alone has no such tail; the least gain of a claim accounts for it.
         noise = float(np.median(list(self.null.values()))) if self.null else 0.0
         sets = self.sets + _AS_SETS
+        by_joints, by_days = (
+            further * fisher_limit(_ONE_IN, 1, count) for count in (sets, max(self.sets, LEAST_SETS))
+        )
         found = {}
         for key, gain in self.null.items():
             mean = (self.sets * gain + _AS_SETS * float(np.mean(by_cause[key[0]]))) / sets
-            factor = fisher_limit(_ONE_IN, 1, independent(key, self.sets, sets)) * further
-            found[key] = noise + factor * max(mean - noise, 0.0)
-        # On a healthy arm a cause reaches at least the gain of its special cases, and is not counted beside them.
-        for effect in EFFECTS.values():
-            for case in effect.contains:
-                for (cause, joint), limit in list(found.items()):
-                    if cause == case:
-                        found[effect.cause, joint] = max(limit, found.get((effect.cause, joint), 0.0))
+            beyond = max(mean - noise, 0.0)
+            found[key] = OfDays(beyond, noise + by_joints * beyond, noise + by_days * beyond)
         return found
 
     def carrying(self, values: Floats, covariance: Floats) -> Reference:

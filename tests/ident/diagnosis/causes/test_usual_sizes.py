@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,12 +13,13 @@ from fri.errors import ConfigurationError
 from ident.diagnosis.causes.candidates import Candidate, Trial
 from ident.diagnosis.causes.claims import Claim
 from ident.diagnosis.causes.healthy_null import HealthyNull
-from ident.diagnosis.causes.usual_sizes import Healthy, UsualSize, scatter_limits, usual_sizes
+from ident.diagnosis.causes.usual_sizes import Healthy, OfDays, UsualSize, scatter_limits, usual_sizes
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.verdict.confidence import Grounds
 from ident.diagnosis.verdict.confirmation import _plain
 from ident.effects import EFFECTS, Shape
+from ident.effects.course import Course
 
 KEY = ("stribeck", 0)
 
@@ -162,6 +164,46 @@ def test_a_limit_grows_with_what_unlike_sessions_show() -> None:
         Healthy({trial.candidate.key: 10.0}, {trial.candidate.key: {short: 2.0}}),
     )
     assert null.limit(trial) == pytest.approx(40.0)
+
+
+def _drifts(gains: Sequence[float], cause: str = "friction_temperature") -> list[bool]:
+    """Whether the step between sessions of each joint, of these gains, is more than on a healthy arm: two sets with a
+    mean gain of 50 each, of days alike by chance."""
+    step = Shape(Course.LEVEL_AND_STEP, since=2)
+    trials = [
+        Trial(Candidate(EFFECTS[cause], joint), step, score(np.sqrt(gain / 100.0)), {})
+        for joint, gain in enumerate(gains)
+    ]
+    dictionary = SimpleNamespace(
+        information=lambda _: {},
+        nearest=lambda _: repr(step),
+        shape=lambda *_: step,
+        scored=lambda candidate, _: trials[candidate.joint].score,
+    )
+    keys = [trial.candidate.key for trial in trials]
+    healthy = Healthy(
+        dict.fromkeys(keys, 500.0),
+        sizes=dict.fromkeys(keys, (UsualSize(repr(step), np.array([0.7]), 1.0), 15.0)),
+        days=dict.fromkeys(keys, OfDays(50.0, 500.0, 4000.0)),
+    )
+    null = HealthyNull(dictionary, DiagnosisSettings(), healthy)  # type: ignore[arg-type]
+    null.meet(trials)
+    return [null.exceeded(trial) for trial in trials]
+
+
+@pytest.mark.parametrize("cause", ["friction_temperature", "sensor_offset_drift"])
+def test_a_step_between_sessions_is_told_beyond_the_state_of_the_day(cause: str) -> None:
+    """Two sets of days alike by chance say nothing of other days; the other joints share the day's state."""
+    # A warmer day: more than in both sets, in all joints.
+    assert not any(_drifts([200.0, 150.0, 250.0, 180.0], cause))
+    assert not any(_drifts([1000.0, 700.0, 600.0, 900.0], cause))
+    # One joint alone, on an ordinary day and on a warmer one.
+    assert _drifts([60.0, 40.0, 900.0, 50.0], cause) == [False, False, True, False]
+    assert _drifts([200.0, 250.0, 3000.0, 150.0], cause) == [False, False, True, False]
+    # All joints, beyond any day that two sets leave room for.
+    assert all(_drifts([5000.0, 6000.0, 7000.0, 6000.0], cause))
+    # Too few joints tell nothing of the day.
+    assert _drifts([60.0, 900.0], cause) == [False, False]
 
 
 def test_a_usual_size_is_read_as_it_was_written() -> None:
