@@ -511,7 +511,7 @@ _STEP_RAD = 1e-4
 class EncoderEccentricity(Effect):
     """The encoder reads `cosine cos(k q) + sine sin(k q)` too much, with k cycles a turn of the joint.
 
-    The arm moves by the published motion minus that error and its derivatives, so all rows see it.
+    Link and drive move by the published motion minus that error and its derivatives, so all rows see it.
     """
 
     cause = "encoder_eccentricity"
@@ -541,16 +541,18 @@ class EncoderEccentricity(Effect):
         return [Shape(cycles_per_turn=k) for k in (1, 2)]
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
-        """Change of the joint torque with the joint displaced by the error, in all rows."""
+        """Change of the joint torque with the joint displaced by the error, in all rows, and of its drive's own."""
         k = shape["cycles_per_turn"]
         q, qd, qdd = (values[:, joint] for values in (motion.q, motion.qd, motion.qdd))
         cos, sin = np.cos(k * q), np.sin(k * q)
-        found = []
+        here, found = np.eye(motion.n)[joint], []
         # Error e(q), its slope e' and curvature e'': the rate is e' qd, the acceleration e'' qd^2 + e' qdd.
         for error, slope, curvature in ((cos, -k * sin, -(k**2) * cos), (sin, k * cos, -(k**2) * sin)):
-            moved = (error, slope * qd, curvature * qd**2 + slope * qdd)
-            shifts = (-_STEP_RAD * part for part in moved)
-            found.append(both_sides(motion.displaced(joint, *shifts) / _STEP_RAD))
+            rate, acceleration = slope * qd, curvature * qd**2 + slope * qdd
+            shifts = (-_STEP_RAD * part for part in (error, rate, acceleration))
+            links = motion.displaced(joint, *shifts) / _STEP_RAD
+            drive = motion.inertia[joint] * acceleration + motion.viscous[joint] * rate
+            found.append(Column(motor=links - drive[:, None] * here, joint=links))
         return tuple(found)
 
     def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:

@@ -155,6 +155,12 @@ class ArmMotion:
         return np.sign(self.motor_speed) if self.slip is None else self.slip
 
     @cached_property
+    def viscous(self) -> Floats:
+        """Viscous friction (n,) of the drives [Nm s/rad]."""
+        one = np.ones((1, self.n))
+        return np.asarray((self.friction(2.0 * one) - self.friction(one))[0])
+
+    @cached_property
     def drive_friction(self) -> Floats:
         """Friction (N, n) of the drives [Nm]."""
         return self.friction(self.motor_speed) + self.motor_coulomb * (

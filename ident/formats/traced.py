@@ -89,6 +89,7 @@ class TracedMotion:
         self.chain, self.n, self.bodies, self.loaded = model.chain, model.chain.n, model.bodies, model.loaded
         self.q, self.qd, self.qdd = (self._row(values) for values in (q, qd, qdd))
         self.motor_speed, self.motor_acceleration = self.qd, self.qdd
+        self.inertia, self.viscous = model.drive[:, 0], model.drive[:, 4]
         self.direction = self._row([speed_sign(graph, model, speed) for speed in qd])
         own = linear["joint"] if "joint" in model.sides else self._rigid(model.bodies, q, qd, qdd)
         self.joint_torque = self._row(own)

@@ -273,6 +273,25 @@ def test_drive_warms_up_by_the_power_of_its_friction(motion: ArmMotion) -> None:
     assert at(0.3, "heated by friction")[-1] < 0.3 * expected[-1] + 1e-9
 
 
+@pytest.mark.parametrize("cycles", [1, 2])
+def test_an_eccentric_encoder_errs_in_the_motion_of_the_drive_as_well(cycles: int, motion: ArmMotion) -> None:
+    """Drive inertia and viscous friction see the slope and curvature of the reading error, in the motor torque only."""
+    effect, size = EFFECTS["encoder_eccentricity"], 1e-5
+    q, qd, qdd = (values[:, 1] for values in (motion.q, motion.qd, motion.qdd))
+    slope, curvature = cycles * np.cos(cycles * q), -(cycles**2) * np.sin(cycles * q)
+    true = motion.motor_speed.copy()
+    true[:, 1] -= size * slope * qd
+    friction = (motion.friction(true) - motion.friction(motion.motor_speed))[:, 1]
+    expected = friction / size - motion.inertia[1] * (curvature * qd**2 + slope * qdd)
+    _, sine = effect.columns(motion, 1, Shape(cycles_per_turn=cycles))
+    assert sine.motor is not None
+    assert sine.joint is not None
+    own = sine.motor - sine.joint
+    np.testing.assert_allclose(own[:, 1], expected, atol=1e-6)
+    assert np.std(expected) > 0.1
+    assert not np.any(own[:, [0, 2]])
+
+
 @pytest.mark.parametrize("cause", ["motor_torque_delay", "joint_torque_delay"])
 def test_no_delay_falls_between_the_shapes_that_are_tried(cause: str) -> None:
     effect = EFFECTS[cause]

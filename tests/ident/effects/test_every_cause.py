@@ -149,12 +149,13 @@ def simulated(
         shift[k] = reading.position - motion.q[k]
         turned.append(np.array(plant.model.gravity.linear))
     if np.any(shift):
-        # The arm stands at the published position less the shift.
+        # The arm stands at the published position less the shift, the drive only behind a wrong reading.
         rate = np.gradient(shift, DT, axis=0)
         change = np.gradient(rate, DT, axis=0)
         moved = motion.rigid_torque(motion.q - shift, motion.qd - rate, motion.qdd - change)
         moved = moved - motion.rigid_torque(motion.q, motion.qd, motion.qdd)
-        motor, joint = motor + moved, joint + moved
+        drive = VISCOUS * rate if effect.cause == "encoder_eccentricity" else 0.0
+        motor, joint = motor + moved - drive, joint + moved
     if not np.array_equal(turned[-1], down):
         tilted = replace(motion.chain, gravity=turned[-1])
         change = regressor.gravity_torque(tilted, motion.q, motion.bodies)
