@@ -203,6 +203,15 @@ def _content(found: Reference, paths: list[list[Path]], out: Path) -> dict[str, 
     return {"file": out, "sets": paths, **{k: v for k, v in stored.items() if k != "sets"}}
 
 
+def _percent(std: float, compliance: float) -> str:
+    """Standard error of a compliance in percent. Beyond that of a stated one it is none."""
+    from ident.diagnosis.healthy.bench import UNSURE
+
+    if not (std > 0.0 and compliance > 0.0):
+        return "–"
+    return "unknown" if std >= UNSURE * compliance else f"{100.0 * std / compliance:.0f}"
+
+
 def _ending(
     found: Reference, sets: int, sessions: int, names: tuple[str, ...], out: Path, *, stated: bool
 ) -> Ending:
@@ -214,8 +223,7 @@ def _ending(
         rows.append(("stiffness [Nm/rad]", *(f"{1.0 / c:.0f}" if c else "rigid" for c in found.compliance)))
         if found.compliance_std is not None:
             known = zip(found.compliance_std, found.compliance, strict=True)
-            differ = (f"{100.0 * std / c:.0f}" if std > 0.0 and c > 0.0 else "–" for std, c in known)
-            rows.append(("  ± [%]", *differ))
+            rows.append(("  ± [%]", *(_percent(std, c) for std, c in known)))
     rows += [(f"noise, {side} [Nm]", *(f"{v:.4f}" for v in values)) for side, values in found.noise.items()]
     delays = [
         (f"{side} torque", f"{1e3 * delay:.2f} ± {1e3 * found.delay_std_s[side]:.2f} ms from day to day")
@@ -242,7 +250,12 @@ def _ending(
     if unknown := ", ".join(found.unknown_stiffness):
         held = stated and found.encoder == "motor"
         held_to = "held to the stated one within a factor of two; " if held else ""
-        text = f"the sets do not tell it within 20 % in {unknown}; {held_to}more sets, or faster motions"
+        mend = (
+            "more sets, or faster motions"
+            if len(found.noise) > 1
+            else "joint torques beside the motors' tell it"
+        )
+        text = f"the sets do not tell it within 20 % in {unknown}; {held_to}{mend}"
         look.append(Verdict("stiffness unknown", text, "", "look"))
     return Ending(
         "look" if look else "good",

@@ -10,6 +10,7 @@ import pytest
 
 from ident.diagnosis.outcome.look_alikes import LookAlikes
 from lwr_driver.session import describe
+from runner.commands.commission import _percent
 from runner.ending import compared, numbers_of, of_session
 from tests.lwr_driver.session.test_reader import plain_messages, ros_session
 
@@ -144,3 +145,11 @@ def test_parameters_of_no_real_body_have_a_line_unless_they_are_warned_of() -> N
 )
 def test_a_condition_number_of_rounding_is_told_as_infinite(condition: float, told: str) -> None:
     assert dict(numbers_of({"sessions": [], "condition": condition}))["condition number"].startswith(told)
+
+
+@pytest.mark.parametrize(
+    ("share", "told"), [(0.0, "–"), (0.09, "9"), (0.49, "49"), (0.5, "unknown"), (16.4, "unknown")]
+)
+def test_a_stiffness_known_no_better_than_a_stated_one_is_unknown(share: float, told: str) -> None:
+    assert _percent(share * 2e-4, 2e-4) == told
+    assert _percent(share, 0.0) == "–"

@@ -109,12 +109,13 @@ def prepare_bench(
     # A fitted arm is near enough, and scaled again in each round it would lose the description.
     elastic = fit_compliance and np.any(arm.anchor > 0.0)
     as_described = np.array_equal(arm.compliance, arm.anchor) or not arm.compliance.any()
-    if elastic and arm.encoder == "motor" and as_described:
+    # One torque alone does not tell a twist from friction and inertia.
+    fitted = elastic and len({side for one in recordings for side in one.sides}) == 2
+    if fitted and arm.encoder == "motor" and as_described:
         arm = _roughly_stiff(arm, recordings, settings, reference)
     structure, base = structure_of(arm, recordings)
     nominal = Nominal(arm, recordings, settings, structure, base)
     prior = _drawn(nominal) if reference is None else reference.prior(base, nominal.masses)
-    fitted = elastic and len(nominal.rows) == 2
     # Predictions of the second round include the reference; a third changes nothing.
     rounds = 3 if fitted else 2 if reference is not None else 1
     # These days alone come first, but for what only a channel left out would tell.

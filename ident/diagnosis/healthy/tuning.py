@@ -184,12 +184,14 @@ def _middle(arms: Sequence[NominalArm]) -> NominalArm:
 def with_compliance_std(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = ()) -> NominalArm:
     """The arm with the standard error of its compliance from those of the sets (n,) [rad/Nm] and by each one's rows,
     and with the stated one, known to a factor, where encoders at the motors do not tell it: the sets do not agree on
-    one, or end at that factor. Behind encoders at the links a stated one that no set shows is unknown. Without a stated
-    one a joint is rigid where the sets do not clearly tell that it twists.
+    one, or end at that factor. Behind encoders at the links a stated one that no set shows is unknown, and so is one
+    that no set was fitted to. Without a stated one a joint is rigid where the sets do not clearly tell that it twists.
     """
     std = compliance_std(sets, own)
     if arm.stated is None:
         return replace(arm, compliance_std=std)
+    if arm.stated.any() and not own and all(np.array_equal(one, arm.stated) for one in sets):
+        return replace(arm, compliance_std=UNSURE * arm.stated)
     low, high = _END / arm.within * arm.stated, arm.largest_compliance / _END
     ends = np.any([(one < low) | (one > high) for one in sets], axis=0)
     if arm.within > STATED_WITHIN:

@@ -250,6 +250,37 @@ def test_a_joint_that_hardly_moves_is_known_as_stated(arm: NominalArm, encoder: 
     np.testing.assert_allclose(found.compliance_std, [1e-6 / np.sqrt(2.0), 0.5e-4, 0.5e-4])
 
 
+@pytest.mark.parametrize("encoder", ["link", "motor"])
+def test_a_stiffness_that_no_set_was_fitted_to_is_known_as_stated(
+    arm: NominalArm, encoder: EncoderSide
+) -> None:
+    """Sets that all have the stated one did not find it."""
+    stated = np.full(3, 1e-4)
+    found = with_compliance_std(replace(arm, encoder=encoder, compliance=stated, stated=stated), [stated] * 2)
+    np.testing.assert_array_equal(found.compliance, stated)
+    np.testing.assert_allclose(found.compliance_std, 0.5 * stated)
+
+
+def test_motor_torques_alone_leave_the_stated_stiffness(
+    arm: NominalArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They do not tell a twist from friction and inertia; a coarse search among factors would still find one."""
+    stated = np.full(3, 1e-4)
+    elastic = replace(arm, encoder="motor", compliance=stated, stated=stated)
+
+    def stop(chosen: NominalArm, recordings: Any) -> Any:
+        raise InterruptedError(chosen.compliance)
+
+    monkeypatch.setattr(bench, "structure_of", stop)
+    monkeypatch.setattr(bench, "_roughly_stiff", lambda arm, *rest: replace(arm, compliance=2.0 * stated))
+    for sides, factor in ((("motor",), 1.0), (("motor", "joint"), 2.0)):
+        with pytest.raises(InterruptedError) as raised:
+            bench.prepare_bench(
+                elastic, [SimpleNamespace(sides=sides)], DiagnosisSettings(), None, (), fit_compliance=True
+            )
+        np.testing.assert_allclose(raised.value.args[0], factor * stated)
+
+
 def test_sets_that_agree_know_a_stiffness_no_better_than_their_rows() -> None:
     sets, own = [np.full(3, 1e-4)] * 4, [np.array([0.0, 1e-5, 2e-5])] * 4
     np.testing.assert_allclose(compliance_std(sets, own), [0.0, 0.5e-5, 1e-5])
