@@ -32,7 +32,7 @@ from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.verdict.conclusion import conclude
 from ident.diagnosis.verdict.doubtful_channels import bending, held_back, unconfirmed, without_payloads
 from ident.diagnosis.verdict.late_channels import in_time, late_by_themselves, without_late
-from ident.diagnosis.verdict.payloads import other_masses, payload_finding, unstated_body, with_masses
+from ident.diagnosis.verdict.payloads import other_masses, payload_findings, unstated_body, with_masses
 from ident.diagnosis.verdict.task import Simulate, State, Task
 from ident.dynamics.kinematics import Chain
 from ident.effects import DELAYS, EFFECTS, PRESLIDING
@@ -107,8 +107,7 @@ def diagnose(
         state = _refined(task, in_time(task, first))
         state = replace(state, notes=(*state.notes, *late_by_themselves(task.apart, state)))
         if reference is not None and payloads_told:
-            loads = [payload_finding(one) for one in (*others, body) if one is not None]
-            state = replace(state, loads=tuple(loads))
+            state = replace(state, loads=tuple(payload_findings(others, body, recordings)))
         else:
             state = replace(state, notes=(*state.notes, *(one.text for one in others)))
         found = held_back(conclude(task, state), doubts, chain.joint_names)

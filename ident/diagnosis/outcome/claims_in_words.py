@@ -106,7 +106,8 @@ def finding_statement(
         meaning = f"{summary_of(cause)}: {detail}."
     elif finding.get("parameters"):
         meaning = f"{summary_of(cause)}: {described(cause, values_of(finding), finding.get('form'), names)}"
-        meaning += f", {mode} sessions." if mode else "."
+        meaning += f", {mode} sessions" if mode else ""
+        meaning += f"{_carried(finding)}."
         meaning = meaning.replace(MODELS, "the healthy arm's") if compared else meaning
         meaning = _SESSION.sub(
             lambda found: sessions[int(found[1]) - 1] if int(found[1]) <= len(sessions) else found[0], meaning
@@ -143,6 +144,14 @@ def finding_statement(
         tuple(_statistics(finding)),
         doubt,
     )
+
+
+def _carried(finding: Plain) -> str:
+    """The sessions of a finding of some alone, with the payload that they state for a finding of it."""
+    if not finding.get("sessions"):
+        return ""
+    payload = finding.get("payload")
+    return f"; {f'payload {payload!r} ' if payload else ''}in {', '.join(finding['sessions'])}"
 
 
 def _noises(times: float) -> str:

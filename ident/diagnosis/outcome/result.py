@@ -60,7 +60,8 @@ class Finding:
     """A claim. joints : from 1, empty for the whole arm. mode : `within` or `between` sessions, or None.
 
     alternatives : (cause, joints, delta_bic). gain : fall of the cross-validated chi-square. grounds : of the
-    confidence, see `confidence.Grounds`. detail : in words, what was counted in the samples.
+    confidence, see `confidence.Grounds`. detail : in words, what was counted in the samples. sessions : names of those
+    with it, empty where it is not of some alone; payload : of a payload's error, its name, None for the bare flange.
     """
 
     cause: str
@@ -77,6 +78,8 @@ class Finding:
     form: str | None = None
     grounds: Mapping[str, float] = field(default_factory=dict)
     detail: str | None = None
+    sessions: tuple[str, ...] = ()
+    payload: str | None = None
 
     @property
     def values(self) -> dict[str, tuple[float, float, str]]:
@@ -115,6 +118,8 @@ class Finding:
             content["grounds"] = dict(self.grounds)
         if self.detail is not None:
             content["detail"] = self.detail
+        if self.sessions:
+            content |= {"sessions": list(self.sessions), "payload": self.payload}
         return content
 
     def __str__(self) -> str:

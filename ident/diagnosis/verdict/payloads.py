@@ -4,11 +4,14 @@ A payload of the healthy arm is tied to its mass. A much heavier or lighter one,
 every other parameter and leave its torque to the gains of the sensors. So it is looked for first, by these sessions
 alone, told as a finding, and then has a mass of its own. So is a body on the flange in all sessions that none of them
 states: held-out rows cannot show it, for the last link's parameters take it up.
+
+A payload counts from what the sessions without one carry. So a body in these alone makes the last link heavier and the
+payload lighter by as much: what a session carries beyond what it says is the sum of both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,6 +21,7 @@ from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.healthy.bench import DiagnosisBench
 from ident.diagnosis.healthy.reference import WEIGHED, Reference, announced_masses, last_body
 from ident.diagnosis.outcome.result import Finding, FindingEvidence, Value
+from ident.diagnosis.rows.recording import SessionRecord
 from ident.diagnosis.verdict.confidence import LIMITS, Grounds, probability
 from ident.diagnosis.verdict.task import Task
 from ident.dynamics.base_set import BaseSet
@@ -54,6 +58,22 @@ class OtherMass:
         return ((self.mass - self.expected) / max(self.std, 1e-12)) ** 2
 
     @property
+    def clear(self) -> bool:
+        """Whether the difference is of interest, and hardly chance."""
+        return abs(self.mass - self.expected) > _OTHER * self.expected and self.square > self.least
+
+    def with_body(self, body: UnstatedBody) -> OtherMass:
+        """The same with an unstated body on the last link, which the payload counts from."""
+        off = self.mass - self.expected
+        both = off + float(body.values[0])
+        return replace(
+            self,
+            mass=self.expected + both,
+            std=float(np.hypot(self.std, np.sqrt(body.covariance[0, 0]))),
+            fall=self.fall * (both / off) ** 2 if off else self.fall,
+        )
+
+    @property
     def text(self) -> str:
         """For a note."""
         return (
@@ -80,7 +100,7 @@ def other_masses(bench: DiagnosisBench, reference: Reference | None) -> list[Oth
         std = float(np.sqrt(max(covariance[k, k], 0.0) + usual))
         fall = (float(values[k]) - expected) ** 2 / max(float(inverse[k, k]), 1e-300)
         one = OtherMass(payload, float(values[k]), expected, std, least, fall)
-        if abs(one.mass - expected) > _OTHER * expected and one.square > least:
+        if one.clear:
             found.append(one)
     return found
 
@@ -202,8 +222,24 @@ def _healthy(bench: DiagnosisBench, reference: Reference) -> dict[int, tuple[flo
     return {b: (float(own.values[a]), float(own.covariance[a, a])) for a, b in pairs}
 
 
-def payload_finding(one: OtherMass | UnstatedBody) -> Finding:
-    """The finding of a payload of another mass, or of a body that no session states."""
+def payload_findings(
+    others: Sequence[OtherMass], body: UnstatedBody | None, records: Sequence[SessionRecord]
+) -> list[Finding]:
+    """The findings of payloads of another mass and of a body that no session states, each with the sessions that carry
+    it. others : masses on a last link without the body."""
+    mounted = {name: [r.name for r in records if r.payload == name] for name in {r.payload for r in records}}
+    if body is None:
+        return [payload_finding(one, mounted.get(one.payload, ())) for one in others]
+    carried = [one.with_body(body) for one in others]
+    found = [payload_finding(one, mounted.get(one.payload, ())) for one in carried if one.clear]
+    known = {one.payload for one in others}
+    bearing = [r.name for r in records if r.payload not in known]
+    # Each of the payloads is told by itself, and none of the sessions is left with the body.
+    return [*found, payload_finding(body, bearing)] if bearing else found
+
+
+def payload_finding(one: OtherMass | UnstatedBody, sessions: Sequence[str] = ()) -> Finding:
+    """The finding of a payload of another mass, or of a body that no session states. sessions : that carry it."""
     if isinstance(one, OtherMass):
         parameters = {"mass": Value(one.mass - one.expected, one.std, "kg")}
     else:
@@ -230,6 +266,8 @@ def payload_finding(one: OtherMass | UnstatedBody) -> Finding:
         tell_apart=PAYLOAD_ERROR.tell_apart,
         gain=one.fall,
         grounds=grounds.to_dict(),
+        sessions=tuple(sessions),
+        payload=one.payload if isinstance(one, OtherMass) else None,
     )
 
 

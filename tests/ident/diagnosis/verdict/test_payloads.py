@@ -13,8 +13,10 @@ import pytest
 from ident.diagnosis.healthy.reference import Reference, announced_masses, last_body
 from ident.diagnosis.verdict.payloads import (
     OtherMass,
+    UnstatedBody,
     other_masses,
     payload_finding,
+    payload_findings,
     unchecked_masses,
     unstated_body,
     with_masses,
@@ -176,3 +178,44 @@ def test_no_body_is_told_of_differences_that_another_cause_explains_better(base:
     alone, noisy = told(3.0 * BODY, 0.0), told(3.0 * BODY, 0.02 * turned)
     assert noisy.covariance[0, 0] > 2.0 * alone.covariance[0, 0]
     assert noisy.square < alone.square
+
+
+def unstated(mass: float) -> UnstatedBody:
+    values = np.array([mass, 0.03, 0.01, 0.09, *[0.0] * 6])
+    return UnstatedBody(values, np.diag([0.1, *[0.01] * 9]) ** 2, 60.0, 12.0, 900.0)
+
+
+@pytest.mark.parametrize(
+    ("body", "more", "told"),
+    [
+        # A body in the bare session alone makes the payload lighter by as much.
+        (1.2, -1.2, [(None, ("bare.mcap", "other.mcap"), 1.2)]),
+        # The same body below the payload, too; then no mass counts from it.
+        (1.2, None, [(None, ("bare.mcap", "loaded.mcap", "other.mcap"), 1.2)]),
+        (None, -1.2, [("weight", ("loaded.mcap",), -1.2)]),
+        (1.2, 0.9, [("weight", ("loaded.mcap",), 2.1), (None, ("bare.mcap", "other.mcap"), 1.2)]),
+        (1.2, -2.0, [("weight", ("loaded.mcap",), -0.8), (None, ("bare.mcap", "other.mcap"), 1.2)]),
+    ],
+)
+def test_a_mass_counts_from_what_the_bare_flange_carries(
+    body: float | None, more: float | None, told: list[tuple[str | None, tuple[str, ...], float]]
+) -> None:
+    mounted = {"bare.mcap": None, "loaded.mcap": "weight", "other.mcap": "other"}
+    records: Any = [SimpleNamespace(name=name, payload=payload) for name, payload in mounted.items()]
+    others = [] if more is None else [OtherMass("weight", 3.0 + more, 3.0, 0.1, 12.0, 900.0)]
+    found = payload_findings(others, None if body is None else unstated(body), records)
+    assert [(one.payload, one.sessions) for one in found] == [(payload, names) for payload, names, _ in told]
+    masses = [one.parameters["mass"].value for one in found]
+    assert masses == pytest.approx([mass for *_, mass in told])
+    for one in found:
+        content = one.to_dict()
+        assert (content["payload"], content["sessions"]) == (one.payload, list(one.sessions))
+        said = " ".join(str(one).split())
+        assert f"{f'payload {one.payload!r} ' if one.payload else ''}in {', '.join(one.sessions)}." in said
+
+
+def test_a_mass_beside_a_body_is_as_uncertain_as_both() -> None:
+    one = OtherMass("weight", 3.5, 3.0, 0.3, 12.0, 100.0).with_body(unstated(0.5))
+    assert one.mass == pytest.approx(4.0)
+    assert one.std == pytest.approx(np.hypot(0.3, 0.1))
+    assert one.fall == pytest.approx(400.0)
