@@ -224,7 +224,17 @@ def _told(at: Sequence[Callable[[float], SessionRows]]) -> list[Delay | None]:
         if not fits_better(after, before, sides):
             none = "with it no row fits better"
             told = [
-                delay and replace(delay, seconds=0.0, std=float(np.hypot(delay.std, delay.seconds)), how=none)
+                delay
+                and replace(
+                    delay, seconds=0.0, std=float(np.hypot(delay.std, delay.seconds)), how=none, sure=False
+                )
                 for delay in told
             ]
+    early = {k: delay.estimate for k, delay in enumerate(told) if delay is not None and delay.early}
+    if early:
+        # What the model lacks of friction at reversals and of elastic joints looks early to one step from rows in time.
+        moved = [at[k](early[k]) if k in early else one for k, one in enumerate(found)]
+        after, before = (stack([one.problem for one in rows]) for rows in (moved, found))
+        sure = fits_better(after, before, sides)
+        told = [delay and replace(delay, sure=delay.sure and sure) for delay in told]
     return told

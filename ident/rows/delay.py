@@ -91,7 +91,8 @@ class Delay:
     by_joint : delay of each moving joint by itself, and its standard deviation, with that of its compliance [s].
     disagreement : scatter of the joints over their standard deviations; `std` already includes this factor.
     earliest : least delay [s]: zero, or -inf where the positions are late. apart : joints clearly late by themselves,
-        or early, against those that agree.
+        or early, against those that agree. sure : whether the estimate is beyond the scatter of its joints, and rows
+        fit better with it.
     """
 
     seconds: float
@@ -102,6 +103,7 @@ class Delay:
     disagreement: float = 1.0
     earliest: float = 0.0
     apart: tuple[str, ...] = ()
+    sure: bool = True
 
     @classmethod
     def of(
@@ -127,8 +129,8 @@ class Delay:
 
     @property
     def early(self) -> bool:
-        """Whether the estimate is before the earliest, beyond its interval and beyond the elasticity of joints."""
-        return self.estimate < self.earliest - 3.0 * self.std - _ELASTIC_S
+        """Whether the estimate is sure and before the earliest, beyond its interval and the elasticity of joints."""
+        return self.sure and self.estimate < self.earliest - 3.0 * self.std - _ELASTIC_S
 
     @property
     def torn(self) -> tuple[str, str] | None:
@@ -338,7 +340,8 @@ def _agreed(names: Sequence[str], values: Floats, stds: Floats, side: str) -> De
     if (disagree or side == "joint") and abs(delay.estimate) < _ALIKE * delay.std * len(chosen) ** 0.5:
         # A scatter that is not one of a delay is no uncertainty of it: on a real arm it is ten times too large.
         std = 0.0 if disagree else float(np.hypot(delay.std, delay.seconds))
-        delay = replace(delay, seconds=0.0, std=std, how="the joints disagree" if disagree else delay.how)
+        how = "the joints disagree" if disagree else delay.how
+        delay = replace(delay, seconds=0.0, std=std, how=how, sure=False)
     return delay
 
 

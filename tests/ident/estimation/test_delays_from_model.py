@@ -58,6 +58,28 @@ def test_a_late_channel_is_found_with_its_interval(late_s: float) -> None:
     )
 
 
+def test_late_positions_are_told_by_torques_that_fit_better_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    def warnings() -> list[str]:
+        return [text for one in estimated(-0.008).prepared for text in one.warnings if "ms early" in text]
+
+    assert len(warnings()) == 2
+    # One step from rows in time says little of where they fit best.
+    monkeypatch.setattr(session_rows, "fits_better", lambda *given: False)
+    assert warnings() == []
+
+
+def test_joints_that_disagree_are_not_early() -> None:
+    """Delays of a healthy arm whose friction turns over a path."""
+    names = ["a1", "a2", "a3", "a4", "a5", "a6"]
+    values = np.array([4.67, -4.72, -3.52, 3.36, -1.71, 1.71]) * 1e-3
+    stds = np.array([2.05, 1.73, 2.28, 5.23, 4.21, 6.50]) * 1e-3
+    delay = delay_module._agreed(names, values, stds, "motor")
+    assert delay.estimate == pytest.approx(-3.4e-3, abs=1e-4)
+    assert not delay.early
+    # Seven times as sure all of them are.
+    assert delay_module._agreed(names, np.full(6, -4.4e-3), stds / 7.0, "motor").early
+
+
 def test_a_punctual_channel_is_not_late_and_its_interval_is_in_the_deviations() -> None:
     found = estimated(0.0)
     stated = replace(SETTINGS, signals=replace(SETTINGS.signals, motor_delay_s=0.0))
