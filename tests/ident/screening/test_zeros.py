@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.parameters import Floats
+from ident.dynamics.parameters import INERTIAL, Floats
 from ident.dynamics.regressor import rigid_regressor, torque
 from ident.screening.zeros import zero_by_gravity
 
@@ -54,3 +54,20 @@ def test_the_zero_of_an_elbow_shows_against_the_gravity_of_the_urdf() -> None:
     assert zero_by_gravity(chain, q, 1.1 * nominal.ravel(), nominal) is None
     # Of a base without gravity along its joints nothing is told.
     assert zero_by_gravity(replace(chain, gravity=np.zeros(3)), q, nominal.ravel(), nominal) is None
+
+
+@pytest.mark.parametrize(
+    ("lever_m", "degrees", "told"), [(0.03, 16.0, False), (0.3, 16.0, True), (0.3, 28.6, False)]
+)
+def test_a_short_lever_tells_no_zero_that_a_misplaced_centre_of_mass_is(
+    lever_m: float, degrees: float, told: bool
+) -> None:
+    """At 3 cm from the wrist's axis 8 mm are 16 degrees; and a least at the end of the range is none."""
+    chain = planar()
+    q = np.random.default_rng(3).uniform(-1.4, 1.4, (80, 4))
+    still, stated = np.zeros_like(q), chain.urdf_inertials().reshape(4, 10).copy()
+    stated[3, [INERTIAL.index("MX"), INERTIAL.index("M")]] = 4.0 * lever_m, 4.0
+    recorded = q.copy()
+    recorded[:, 3] += np.radians(degrees)
+    bodies = identified(chain, recorded, torque(chain, q, still, still, stated))
+    assert (zero_by_gravity(chain, recorded, bodies, stated) is not None) == told
