@@ -293,10 +293,15 @@ def mounted(model: DynamicModel, session: Session) -> str | None:
     if name is None or model.structure.sides == ("difference",):
         return None
     if name not in model.structure.payloads:
-        known = ", ".join(model.structure.payloads) or "none"
+        known = model.structure.payloads
+        same = (
+            f"if it is the same under another name, say so (`--payload {session.path}={known[0]}`); else "
+            if known
+            else ""
+        )
         raise DataError(
-            f"{session.path.name}: payload {name!r} is not in the model (payloads: {known}); validate on a "
-            "session of the bare arm, or identify the payload first with `lwr-run payload`"
+            f"{session.path.name}: payload {name!r} is not in the model (payloads: {', '.join(known) or 'none'}); "
+            f"{same}validate on a session of the bare arm, or identify the payload first with `lwr-run payload`"
         )
     return name
 

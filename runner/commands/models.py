@@ -22,6 +22,12 @@ from runner.terminal import NAMED_FILE, PATH, FiniteRange, forced, json_option, 
 @click.option(
     "--against", multiple=True, type=PATH, metavar="MODEL", help="Another model to compare (repeatable)."
 )
+@click.option(
+    "--payload",
+    multiple=True,
+    metavar="FILE=NAME[:KG]",
+    help="Payload of a session by its name in the model, in place of its metadata.",
+)
 @click.option("--forward", is_flag=True, help="Simulate along the commanded motion too.")
 @click.option("--cross", is_flag=True, help="Cross-validate over the sessions too.")
 @click.option(
@@ -39,6 +45,7 @@ def validate_command(
     as_json: bool,
     allow_seen: bool,
     against: tuple[Path, ...],
+    payload: tuple[str, ...],
     forward: bool,
     cross: bool,
     settings: str | None,
@@ -61,10 +68,10 @@ def validate_command(
     from ident.import_log import read_recording
     from ident.model.model_file import read_model
     from runner.ending import of_validation
-    from runner.estimation import IdentifySettings
+    from runner.estimation import IdentifySettings, announced
 
     tested = read_model(model)
-    logs = [read_recording(path, status=False) for path in sessions]
+    logs = announced([read_recording(path, status=False) for path in sessions], payload, sessions)
     signals = None if settings is None else IdentifySettings.load(settings).signals
     if estimate_delay:
         signals = signals_for(tested, signals, estimate_delay=True)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -16,6 +17,7 @@ from ident.estimation.identify import IdentificationSettings, identify
 from ident.estimation.validate import Validation, cross_validate, validate
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
+from runner.estimation import announced
 
 PLAIN = SignalSettings(motor_delay_s=0.0)
 SIDES = ("motor", "joint")
@@ -143,8 +145,14 @@ def test_a_copy_of_a_session_of_the_estimate_is_no_held_out_one(bench: Any, unlo
 def test_an_unknown_payload_is_refused(truth_model: Any, bench: Any) -> None:
     session = bench.session("strange", seed=3)
     strange = replace(session, metadata={**session.metadata, "payload": "gripper"})
-    with pytest.raises(DataError, match=r"payload 'gripper' is not in the model \(payloads: load\)"):
+    with pytest.raises(
+        DataError, match=r"payload 'gripper' is not in the model \(payloads: load\)"
+    ) as raised:
         validate(truth_model, [strange], settings=PLAIN)
+    (option,) = re.findall(r"`--payload ([^`]+)`", str(raised.value))
+    # The same load under another name is named as the model does.
+    (named,) = announced([strange], [option])
+    assert validate(truth_model, [named], settings=PLAIN).scores
 
 
 def test_a_session_without_the_sides_of_the_model_says_so(truth_model: Any, bench: Any) -> None:
