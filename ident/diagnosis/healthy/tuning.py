@@ -184,8 +184,9 @@ def _middle(arms: Sequence[NominalArm]) -> NominalArm:
 def with_compliance_std(arm: NominalArm, sets: Sequence[Floats], own: Sequence[Floats] = ()) -> NominalArm:
     """The arm with the standard error of its compliance from those of the sets (n,) [rad/Nm] and by each one's rows,
     and with the stated one, known to a factor, where encoders at the motors do not tell it: the sets do not agree on
-    one, or end at that factor. Behind encoders at the links a stated one that no set shows is unknown, and so is one
-    that no set was fitted to. Without a stated one a joint is rigid where the sets do not clearly tell that it twists.
+    one, or end at that factor. Behind encoders at the links a stated one that no set shows is unknown, and so are one
+    that no set was fitted to, and one softer than that factor allows. Without a stated one a joint is rigid where the
+    sets do not clearly tell that it twists.
     """
     std = compliance_std(sets, own)
     if arm.stated is None:
@@ -208,7 +209,13 @@ def with_compliance_std(arm: NominalArm, sets: Sequence[Floats], own: Sequence[F
         # A fit that ends at a rigid joint, or at the softest one, in every set does not differ from set to set.
         ended = (arm.compliance <= 0.0) | (arm.compliance >= high)
         ended &= arm.stated > 0.0
-        return replace(arm, compliance_std=None if std is None else np.where(ended, UNSURE * arm.stated, std))
+        # A joint softer than its description allows has taken up something else: a lag, or friction of another form.
+        softer = (arm.compliance > arm.within * arm.stated) & (arm.stated > 0.0)
+        return replace(
+            arm,
+            compliance=np.where(softer, arm.stated, arm.compliance),
+            compliance_std=None if std is None else np.where(ended | softer, UNSURE * arm.stated, std),
+        )
     # The fit of each set is held to the stated one as far as its rows do not tell.
     unknown = (arm.stated > 0.0) & (ends | unsure(arm.compliance, compliance_std(sets)))
     known = np.zeros(len(arm.stated)) if std is None else std

@@ -22,7 +22,7 @@ from ident.diagnosis.causes.tolerances import gain_rows
 from ident.diagnosis.gain.held_out import HeldOut
 from ident.diagnosis.gain.products import Floats, Rows
 from ident.diagnosis.healthy.bench import DiagnosisBench
-from ident.diagnosis.healthy.reference import INERTIA_BY_PHASE, Reference
+from ident.diagnosis.healthy.reference import INERTIA_BY_PHASE, Reference, unsure
 from ident.diagnosis.outcome.result import Finding, FindingEvidence, Value
 from ident.diagnosis.verdict.confidence import HARDLY
 from ident.effects import FRICTION_TEMPERATURE, WEAR
@@ -106,7 +106,8 @@ def wear(
             continue
         labels = [names[nominal.base.names[k]] for k in places]
         sizes = dict(zip(labels, np.abs(share / std).tolist(), strict=True))
-        elastic = bool(nominal.arm.compliance[joint] > 0.0)
+        bends = nominal.arm.compliance
+        stiff = bool(bends[joint] > 0.0 and not unsure(bends, nominal.arm.compliance_std)[joint])
         heavier = sizes.get("inertia", 0.0) > max(_CLEAR, 0.5 * max(sizes.values()))
         torque = nominal.rows["motor"].matrix[joint][:, places] @ change
         columns = [*claimed, *tolerated, {("motor", joint): torque[:, None]}]
@@ -127,7 +128,7 @@ def wear(
                 evidence=FindingEvidence(
                     -square, p_value, before, rms, (before - rms, before - rms), (("motor", joint + 1),)
                 ),
-                confidence=sure if heavier and elastic else min(sure, _WORN_OR_WARM),
+                confidence=sure if heavier and stiff else min(sure, _WORN_OR_WARM),
                 alternatives=() if heavier else ((FRICTION_TEMPERATURE.cause, (joint + 1,), -square),),
                 tell_apart=_TELL_APART.format(joint=joint + 1),
                 gain=square,
