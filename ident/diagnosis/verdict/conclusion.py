@@ -210,12 +210,13 @@ def _left(
     """What neither a finding nor a term of the model explains. floor : noise (n,) [Nm] by side."""
     fitted = {(term.side, term.joint) for term in told.nameless}
     rms = told.after.rms()
-    left = [
-        Unexplained(r.side, r.joint, r.depends_on, *_error_and_noise(rms, floor, r.side, r.joint))
-        for r in remainders
-        if (r.side, r.joint) not in fitted and r.inflation > FELT_POWER
-    ]
-    left = [one for one in left if one.beyond_noise]
+    left = []
+    for r in remainders:
+        one = Unexplained(r.side, r.joint, r.depends_on, *_error_and_noise(rms, floor, r.side, r.joint))
+        felt = (r.side, r.joint) not in fitted and r.inflation > FELT_POWER
+        # A line stands out of the spectrum below the noise of a row.
+        if felt and (one.beyond_noise or r.line_hz):
+            left.append(one)
     return [*left, *_beyond_healthy(task, told.before.rms(), rms, floor, findings, told.added, left)]
 
 
