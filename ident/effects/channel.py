@@ -219,6 +219,7 @@ class SensorOffsetDrift(Drifting):
     )
     together = True
     courses = (Course.WITHIN, Course.STEADY)
+    singly = (Course.STEADY_IN_ONE,)
     onsets = (Course.STEP_WITHIN, Course.STEP_UNDONE)
     law = Law("time")
     confused_with = ("payload_change", "joint_zero_offset")

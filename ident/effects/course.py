@@ -29,7 +29,7 @@ TIME_CONSTANT = (
 )
 MOMENT = (
     Parameter("time", "s", "of a step, from the start of its session", shape=True),
-    Parameter("session", "1", "number of the session of the step", shape=True, fixed=True),
+    Parameter("session", "1", "number of the session of the step or drift", shape=True, fixed=True),
 )
 # Time constants to begin with, over the longest session: from a part of it on, and that of a steady drift.
 _SHARES, _STEADY = (0.15, 0.4, 1.0), 5.0
@@ -39,14 +39,15 @@ _LASTING_S = (300.0, 1200.0, 5000.0)
 
 
 class Course(Form):
-    """How a value drifts: as 1 - exp(-t / time_constant) in each session; steadily, by so much a minute; with the
-    heat of the drive's friction in its place; with that heat carried over from session to session; from session
-    `since` on, without and with a level of the sessions before it; in all sessions; from a moment of a session on,
-    for good and until the end of that session.
+    """How a value drifts: as 1 - exp(-t / time_constant) in each session; steadily, by so much a minute, in all
+    sessions or in one; with the heat of the drive's friction in place of the time; with that heat carried over from
+    session to session; from session `since` on, without and with a level of the sessions before it; in all sessions;
+    from a moment of a session on, for good and until the end of that session.
     """
 
     WITHIN = "within a session", "change", "drift", "time_constant"
     STEADY = "steadily within a session", "drift"
+    STEADY_IN_ONE = "steadily within one session", "drift", "session"
     HEATED = "heated by friction", "change", "time_constant"
     CARRIED = "heat carried over", "change", "time_constant"
     STEP = "between sessions", "change", "drift", "since"
@@ -59,10 +60,11 @@ class Course(Form):
 class Drifting(Effect):
     """An effect with a course in time; its first parameter is the change, its second one the level of all sessions.
 
-    courses : forms of the drift within a session.
+    courses : forms of the drift within each session; singly : those within one of several.
     """
 
     courses: ClassVar[tuple[Course, ...]]
+    singly: ClassVar[tuple[Course, ...]] = ()
     forms = Course
     depends_on = "time"
 
@@ -81,6 +83,12 @@ class Drifting(Effect):
                 for time in (lasting if form is Course.CARRIED else times)
             ),
             *([Shape(Course.STEADY)] if steady else []),
+            *(
+                Shape(form, session=k)
+                for form in self.singly
+                if setting.sessions > 1
+                for k in range(1, setting.sessions + 1)
+            ),
             *(Shape(step, since=k) for k in range(2, setting.sessions + 1)),
             Shape(Course.SINCE_REFERENCE),
         ]
@@ -88,7 +96,14 @@ class Drifting(Effect):
     @property
     def known_forms(self) -> tuple[Form, ...]:
         """Those within a session, all between sessions, and those at a moment."""
-        return (*self.courses, Course.STEP, Course.LEVEL_AND_STEP, Course.SINCE_REFERENCE, *self.onsets)
+        return (
+            *self.courses,
+            *self.singly,
+            Course.STEP,
+            Course.LEVEL_AND_STEP,
+            Course.SINCE_REFERENCE,
+            *self.onsets,
+        )
 
     def mode(self, shape: Shape) -> Literal["within", "between"]:
         """Within a session or between sessions."""
@@ -96,8 +111,8 @@ class Drifting(Effect):
         return "between" if lasting else "within"
 
     def passing(self, shape: Shape) -> bool:
-        """Between sessions, or at a moment of one."""
-        return super().passing(shape) or shape.form in self.onsets
+        """Between sessions, or in one of them alone."""
+        return super().passing(shape) or shape.form in (*self.onsets, *self.singly)
 
     def course(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Floats, ...]:
         """Factor (N,) of each coefficient."""
@@ -110,6 +125,8 @@ class Drifting(Effect):
             return (1.0 - np.exp(-motion.time / shape["time_constant"]),)
         if shape.form is Course.STEADY:
             return (motion.time / _MINUTE_S,)
+        if shape.form is Course.STEADY_IN_ONE:
+            return (float(motion.session + 1 == round(shape["session"])) * motion.time / _MINUTE_S,)
         whole = np.ones(len(motion.time))
         if shape.form is Course.SINCE_REFERENCE:
             return (whole,)
@@ -124,6 +141,8 @@ class Drifting(Effect):
     def in_session(self, parameters: Parameters, form: FormName, number: int | None) -> Parameters:
         """Without the step in the sessions before it, and from the start in those after it."""
         course, change = self.form_of(form), self.linear[0].name
+        if course in self.singly and (number is None or number + 1 != round(parameters["session"])):
+            return {**parameters, change: 0.0}
         between = course in (Course.STEP, Course.LEVEL_AND_STEP)
         if between and number is not None and number + 1 < parameters.get("since", 2.0):
             return {**parameters, change: 0.0}
@@ -138,7 +157,7 @@ class Drifting(Effect):
         change, level = self.coefficients_of(parameters)
         if self.form_of(form) is Course.WITHIN:
             change *= 1.0 - np.exp(-time_s / parameters["time_constant"])
-        if self.form_of(form) is Course.STEADY:
+        if self.form_of(form) in (Course.STEADY, Course.STEADY_IN_ONE):
             change *= time_s / _MINUTE_S
         if self.form_of(form) in self.onsets:
             change *= float(time_s >= parameters["time"])
@@ -154,6 +173,8 @@ class Drifting(Effect):
             return [f"{size} against the reference"]
         if form is Course.STEADY:
             return [f"{size} a minute"]
+        if form is Course.STEADY_IN_ONE:
+            return [f"{size} a minute in session {values['session'][0]:.0f} alone"]
         if form in self.onsets:
             step = f"{size} at {quantity(values['time'])} of session {values['session'][0]:.0f}"
             return [step, *(["undone after it"] if form is Course.STEP_UNDONE else [])]

@@ -324,6 +324,25 @@ def test_zero_that_drifts_steadily_is_told_by_its_rate(
     assert drift.std < 0.06
 
 
+def test_zero_that_drifts_in_one_session_alone_is_told_with_its_session(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    def creeps(s: Signals) -> None:
+        s["joint"][:, 1] += 0.6 * s["time"] / 60.0
+
+    sessions = [make("a.mcap", 5), make("b.mcap", 6, creeps, 1)]
+    found = diagnose(sessions, chain, reference=reference)
+    (claim,) = found.claims
+    assert (claim.cause, claim.joints) == ("sensor_offset_drift", (2,))
+    assert claim.form == "steadily within one session"
+    drift = claim.parameters["drift"]
+    assert drift.value == pytest.approx(0.6, abs=3.0 * drift.std)
+    assert claim.parameters["session"].value == 2
+    assert "in b.mcap alone" in str(found)
+    # What one session has, a further one has not.
+    assert not found.extended_model.effects
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("undone", [False, True])
 def test_zero_that_jumps_within_a_session_is_told_with_its_moment(

@@ -94,6 +94,7 @@ def stated(effect: Effect, form: Form | None, motion: ArmMotion) -> dict[str, fl
         if effect.event or form in effect.onsets
         else {}
     )
+    shape |= {"session": 2.0} if "session" in shape else {}
     shape |= {"delay": 0.015} if effect.channel else {}
     # Crossed over so much torque, a gap passes the filter of its twist.
     shape |= {"width": 8.0} if effect.cause == "backlash" else {}
