@@ -106,7 +106,7 @@ def finding_statement(
         meaning = f"{summary_of(cause)}: {detail}."
     elif finding.get("parameters"):
         meaning = f"{summary_of(cause)}: {described(cause, values_of(finding), finding.get('form'), names)}"
-        meaning += f", {mode} sessions" if mode else ""
+        meaning += f", {mode} sessions" if mode == "between" else ""
         meaning += f"{_carried(finding)}."
         meaning = meaning.replace(MODELS, "the healthy arm's") if compared else meaning
         meaning = _SESSION.sub(
