@@ -331,7 +331,8 @@ def groups(
         if of in ("load", "qdd") and name != f"{of}{joint + 1}":
             continue
         names = [name]
-        names += [] if of == "qd" else [f"{name} sign(qd{joint + 1})"]
+        # A function of the own speed has both signs by itself.
+        names += [] if name == f"qd{joint + 1}" else [f"{name} sign(qd{joint + 1})"]
         names += [f"{name} load{joint + 1}"] if of == "q" else []
 
         def made(motion: ArmMotion, curve: Curve = curve, names: list[str] = names) -> list[Column]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fri.errors import DataError
 from ident.diagnosis.causes.claims import Claim
 from ident.diagnosis.causes.probes import Remainder, find_remainders
-from ident.diagnosis.causes.tolerances import Kind
+from ident.diagnosis.causes.tolerances import HABITUAL, Deviation, Kind
 from ident.diagnosis.gain.held_out import BEYOND_HEALTHY, HeldOut, held_out, worse_rows
 from ident.diagnosis.gain.products import Floats, Rows
 from ident.diagnosis.healthy.bench import DiagnosisBench
@@ -40,6 +40,9 @@ from ident.model import DynamicModel
 from ident.rows.data_quality import sample_loss
 
 log = logging.getLogger(__name__)
+
+# Change of a healthy sensor in one of a hundred days, in standard deviations.
+_UNUSUAL = 2.6
 
 
 def conclude(task: Task, state: State) -> Diagnosis:
@@ -90,6 +93,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
         notes=(
             *_notes(task, bench, rms_base),
             *_channel_notes(nominal, claimed.remainders),
+            *tolerated_gains(state.selection.deviations, nominal.arm.chain.joint_names),
             *state.notes,
             *told.notes,
         ),
@@ -418,6 +422,24 @@ def _channel_notes(nominal: Nominal, remainders: Sequence[Remainder]) -> list[st
         for one in r.stuck
     ]
     return lines + stuck
+
+
+def tolerated_gains(deviations: Sequence[Deviation], names: Sequence[str]) -> list[str]:
+    """Gains of torque sensors that are hardly usual and still tolerated, as few healthy sets tell little of the days.
+
+    deviations : in the fit of the claims. names : of the joints.
+    """
+    lines = []
+    for one in deviations:
+        day = one.tolerance.size / HABITUAL
+        if one.tolerance.kind is Kind.GAIN and abs(one.value) > _UNUSUAL * max(day, one.std):
+            lines.append(
+                f"the torque sensor of {names[one.tolerance.number]} reads {100.0 * abs(one.value):.2g} ± "
+                f"{100.0 * one.std:.1g} % too {'much' if one.value > 0.0 else 'little'} against the healthy days, "
+                f"whose sets leave {100.0 * day:.2g} % from day to day open: no finding, and in no model; more healthy "
+                "sets decide"
+            )
+    return lines
 
 
 def _frequency(nominal: Nominal, line_hz: float) -> str:

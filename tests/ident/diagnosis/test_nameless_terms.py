@@ -62,6 +62,16 @@ def test_the_extended_model_has_the_term_after_its_file_is_read_again(
     assert "nameless_motor(2: qd3)" in found.extension
 
 
+def test_friction_by_the_speed_of_a_neighbour_is_one_term(make: Make, chain: Chain) -> None:
+    def stiffer(s: Signals) -> None:
+        s["motor"][:, 1] += 0.3 * np.abs(s["qd"][:, 2]) * np.sign(s["qd"][:, 1])
+
+    fitted = [make("a.mcap", 1, stiffer), make("b.mcap", 2, stiffer, 1)]
+    found = diagnose(fitted, chain, test=[make("c.mcap", 5, stiffer, 2)])
+    assert any(one.depends_on[:2] == ("qd3", "sign(qd2)") for one in found.nameless)
+    assert not any(f.confidence >= 0.8 for f in found.claims)
+
+
 def _entry(form: str) -> dict[str, object]:
     values = {f"value_{k + 1}": {"value": 0.0, "std": 0.0, "unit": "Nm"} for k in range(KNOTS)}
     return {
