@@ -193,6 +193,11 @@ def test_a_stiffness_that_the_sets_do_not_tell_is_the_stated_one(arm: NominalArm
     np.testing.assert_allclose(
         with_compliance_std(replace(ended, compliance=soft[0]), soft).compliance_std, [0.0, 0.5e-4, 0.0]
     )
+    # A fit well within its range that the description rules out is not believed.
+    lagging = [np.array([0.8e-4, 2.5e-4, 0.0])] * 2
+    held = with_compliance_std(replace(ended, compliance=lagging[0]), lagging)
+    np.testing.assert_allclose(held.compliance, [0.8e-4, 1e-4, 0.0])
+    np.testing.assert_allclose(held.compliance_std, [0.0, 0.5e-4, 0.0])
 
 
 def test_rounds_of_a_fit_stay_near_the_stated_stiffness(

@@ -223,6 +223,26 @@ def test_slow_motor_samples_leave_a_drive_inertia_uncertain_by_their_phase(
     assert std[1] ** 2 > std[0] ** 2 + 0.9 * INERTIA_BY_PHASE**2 / 3.0
 
 
+def test_another_inertia_is_sure_only_behind_a_known_stiffness(
+    make: Make, chain: Chain, reference: Reference
+) -> None:
+    """A wrong stiffness looks like inertia, and differs in that with the motion."""
+
+    def heavier(s: Signals) -> None:
+        inertia = reference.model.value("Ia2")
+        s["motor"][:, 1] += 0.4 * inertia * np.gradient(s["qd"][:, 1], s["time"])
+
+    sessions, bends = pair(make, heavier), np.full(3, 1e-6)
+    confidence = []
+    for share in (0.01, 0.5):
+        elastic = replace(reference, compliance=bends, compliance_std=share * bends)
+        found = diagnose(sessions, chain, reference=elastic)
+        (finding,) = [f for f in found.findings if f.cause == "wear" and f.joints == (2,)]
+        confidence.append(finding.confidence)
+    known, unknown = confidence
+    assert unknown <= 0.75 < known
+
+
 def test_a_gain_beyond_the_usual_is_told_with_its_own_size(
     make: Make, chain: Chain, reference: Reference
 ) -> None:
