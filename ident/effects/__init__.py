@@ -35,11 +35,14 @@ from ident.effects.words import Values, quantity, spoken
 __all__ = [
     "BASE_TILT",
     "DELAYS",
+    "ECCENTRICITY",
     "EFFECTS",
     "ELASTICITY",
     "FRICTION_TEMPERATURE",
     "LOST_SAMPLES",
+    "MOTOR_GAIN",
     "NAMELESS",
+    "PAYLOAD_CHANGE",
     "PAYLOAD_ERROR",
     "PRESLIDING",
     "SENSOR_GAIN",
@@ -76,9 +79,12 @@ PRESLIDING = friction.PreslidingHysteresis()
 ELASTICITY = link.JointElasticity()
 BASE_TILT = link.BaseTilt()
 PAYLOAD_ERROR = load.PayloadError()
+PAYLOAD_CHANGE = load.PayloadChange()
 SENSOR_GAIN = channel.SensorGain()
 SENSOR_SATURATION = channel.SensorSaturation()
 ZERO_OFFSET = link.JointZeroOffset()
+ECCENTRICITY = link.EncoderEccentricity()
+MOTOR_GAIN = drive.MotorTorqueGain()
 LOST_SAMPLES = channel.LostSamples()
 DELAYS = {"motor": channel.MotorTorqueDelay(), "joint": channel.JointTorqueDelay()}
 """The effect of a late channel, by side."""
@@ -94,15 +100,15 @@ EFFECTS: dict[str, Effect] = {
         friction.FrictionPosition(),
         PRESLIDING,
         drive.GearRipple(),
-        drive.MotorTorqueGain(),
+        MOTOR_GAIN,
         link.Backlash(),
         ELASTICITY,
         link.CableSpring(),
         BASE_TILT,
         PAYLOAD_ERROR,
-        load.PayloadChange(),
+        PAYLOAD_CHANGE,
         ZERO_OFFSET,
-        link.EncoderEccentricity(),
+        ECCENTRICITY,
         load.Contact(),
         SENSOR_GAIN,
         channel.SensorCrosstalk(),

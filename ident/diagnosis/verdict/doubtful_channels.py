@@ -14,19 +14,29 @@ from ident.diagnosis.outcome.result import Diagnosis, Finding
 from ident.diagnosis.rows.broken_data import BrokenChannel
 from ident.diagnosis.verdict.confirmation import OPEN
 from ident.diagnosis.verdict.task import Task
-from ident.effects import EFFECTS, PAYLOAD_ERROR
+from ident.effects import (
+    DELAYS,
+    ECCENTRICITY,
+    EFFECTS,
+    LOST_SAMPLES,
+    MOTOR_GAIN,
+    PAYLOAD_CHANGE,
+    PAYLOAD_ERROR,
+    SENSOR_SATURATION,
+    ZERO_OFFSET,
+)
 from ident.screening.doubts import Doubt
 
 # Causes that are an error of the channel itself.
 _OWN: Mapping[str, tuple[str, ...]] = {
-    "motor torque": ("motor_torque_gain", "motor_torque_delay"),
+    "motor torque": (MOTOR_GAIN.cause, DELAYS["motor"].cause),
     "joint torque": tuple(cause for cause, effect in EFFECTS.items() if effect.side == "sensor"),
-    "position": ("joint_zero_offset", "encoder_eccentricity"),
-    "time": ("motor_torque_delay", "joint_torque_delay"),
+    "position": (ZERO_OFFSET.cause, ECCENTRICITY.cause),
+    "time": tuple(effect.cause for effect in DELAYS.values()),
 }
 # Counted in the samples, not told by torques.
-_COUNTED = ("lost_samples", "sensor_saturation")
-_PAYLOADS = (PAYLOAD_ERROR.cause, "payload_change")
+_COUNTED = (LOST_SAMPLES.cause, SENSOR_SATURATION.cause)
+_PAYLOADS = (PAYLOAD_ERROR.cause, PAYLOAD_CHANGE.cause)
 
 
 def bending(doubts: Sequence[Doubt]) -> tuple[Doubt, ...]:
