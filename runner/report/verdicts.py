@@ -16,7 +16,6 @@ from ident.diagnosis.outcome.statements import NOTHING, in_short
 from ident.estimation.assumptions import HARMLESS
 from ident.estimators.estimate import two_digits
 from ident.model import DynamicModel
-from runner.report.diagnosis import DiagnosisFolder
 from runner.report.folder import Curves, ResultFolder
 
 Level = Literal["good", "look", "bad"]
@@ -362,6 +361,9 @@ def _diagnosis(results: ResultFolder) -> Verdict | None:
     level, text = in_short(diagnosis, results.joint_names)
     if text.startswith(NOTHING):
         # What is left without a cause is a part of the answer.
+        # Its records come with those of a replay, and a replay with the physics.
+        from runner.report.diagnosis import DiagnosisFolder
+
         folder = DiagnosisFolder.of(results)
         assert folder is not None
         level, text = folder.statements.level, folder.statements.headline + text.removeprefix(NOTHING)

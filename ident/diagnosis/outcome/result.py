@@ -324,7 +324,6 @@ class Diagnosis(Tabular):
                 "simulation_error": base,
             },
             "data": [broken.to_dict() for broken in self.data],
-            "in_doubt": [one.to_dict() for one in self.in_doubt],
             "findings": [finding.to_dict() for finding in self.findings],
             "character": [finding.to_dict() for finding in self.character],
             "healthy": [
@@ -363,7 +362,8 @@ class Diagnosis(Tabular):
 
     @cached_property
     def details(self) -> dict[str, Any]:
-        """Content of `details.json` about the verdict: errors of each joint, parameters moved, limits of the data."""
+        """Content of `details.json` about the verdict: errors of each joint, parameters moved, limits of the data,
+        channels in doubt."""
         return {
             "sessions": list(self.numbered),
             "joints": list(self.base_model.structure.chain.joint_names),
@@ -372,6 +372,7 @@ class Diagnosis(Tabular):
             "rows": row_gains(self),
             "base_parameters": moved_parameters(self),
             "notes": list(self.notes),
+            "in_doubt": [one.to_dict() for one in self.in_doubt],
             "doubted": [finding.to_dict() for finding in self.doubted],
             "torque_errors": session_errors(self),
         }

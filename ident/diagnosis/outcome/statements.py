@@ -297,7 +297,7 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
     if count:
         doubtful = f", {'one' if len(doubts) == 1 else len(doubts)} of them {doubt}"
         return "look", f"{count} causes found, the largest effect first" + (doubtful if doubts else "")
-    if content.get("in_doubt"):
+    if details.get("in_doubt"):
         return "look", "No cause found, but channels of these data are in doubt: check them first"
     if content.get("character"):
         return "good", "No cause found beyond the character of such an arm, which the extended model now has"
@@ -337,14 +337,11 @@ def _lines(
     names: Sequence[str],
 ) -> list[Line]:
     found = []
-    for subject, key, anchor in (
-        ("broken channels", "data", "data"),
-        ("channels in doubt", "in_doubt", "limits"),
+    for subject, channels, anchor in (
+        ("broken channels", content.get("data", ()), "data"),
+        ("channels in doubt", details.get("in_doubt", ()), "limits"),
     ):
-        listed = [
-            f"{_name(d['joint'], names) if d.get('joint') else ''} {d['channel']}"
-            for d in content.get(key, ())
-        ]
+        listed = [f"{_name(d['joint'], names) if d.get('joint') else ''} {d['channel']}" for d in channels]
         text = ", ".join(dict.fromkeys(one.strip() for one in listed))
         found += [Line(subject, text, "none", "look", anchor)] * bool(text)
     for finding in findings:

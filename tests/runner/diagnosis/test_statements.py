@@ -250,8 +250,7 @@ def test_a_moment_is_told_with_the_name_of_its_session() -> None:
 
 def test_channels_in_doubt_are_in_the_short_text() -> None:
     doubts = [{"channel": "motor torque", "joint": joint, "what": "", "advice": ""} for joint in (1, 3, 3)]
-    content = {**CONTENT, "findings": [], "in_doubt": doubts}
-    said = statements(content, details(), NAMES)
+    said = statements({**CONTENT, "findings": []}, details(in_doubt=doubts), NAMES)
     line = next(one for one in said.lines if one.subject == "channels in doubt")
     assert line.found == "A1 motor torque, E1 motor torque"
     assert line.level == said.level == "look"
