@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fri.errors import LwrError
 from ident.diagnosis.healthy.reference import Reference
-from ident.effects import EncoderSide
+from ident.dynamics.structure import EncoderSide
 from ident.model import DynamicModel
 from ident.model.model_file import read_model
 from lwr_driver.configuration import find

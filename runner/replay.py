@@ -29,7 +29,7 @@ from scipy.ndimage import maximum_filter1d
 
 from fri.errors import ConfigurationError, DataError
 from ident.diagnosis import SimulationError
-from ident.effects import EncoderSide
+from ident.dynamics.structure import EncoderSide
 from ident.model import DynamicModel
 from ident.rows.filters import low_pass, median_step
 from ident.rows.sessions import payload_name

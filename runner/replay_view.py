@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.known_arm import known_arm
-from ident.effects import EncoderSide
+from ident.dynamics.structure import EncoderSide
 from ident.model.model_file import read_model
 from ident.rows.sessions import payload_name
 from lwr_driver.arm import Arm

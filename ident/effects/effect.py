@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics.parameters import joint_unit
+from ident.dynamics.structure import EncoderSide
 from ident.effects.motion import ArmMotion, Floats
 from ident.effects.words import Values, quantity, spoken
 
 EffectSide = Literal["motor", "joint", "sensor", "timing"]
-EncoderSide = Literal["link", "motor"]
 """The side of an elastic joint that its positions are of."""
 Variable = Literal["velocity", "load", "position", "time", "motor angle"]
 Parameters = Mapping[str, float]

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from ident.dynamics.parameters import joint_unit
+from ident.dynamics.structure import EncoderSide
 from ident.effects.effect import (
     Column,
     Discriminator,
     Effect,
-    EncoderSide,
     Form,
     Law,
     Loads,

@@ -19,7 +19,7 @@ from scipy.ndimage import correlate1d
 from fri.errors import ConfigurationError
 from fri.quantities import Name, within
 from ident.dynamics.parameters import Floats
-from ident.dynamics.structure import Coupling
+from ident.dynamics.structure import Coupling, EncoderSide
 from ident.rows.butterworth import forward_and_back, sections, spectrum
 from ident.rows.reversals import TURNING_RAD
 
@@ -29,7 +29,6 @@ CUTOFF_HZ, DECIMATE_HZ, REVERSAL_S = 10.0, 2.0, 0.05
 NYQUIST_SHARE = 0.2
 
 
-Encoder = Literal["link", "motor"]
 Frequency = Annotated[float, within(0.0, 1e5, "Hz", above=True)]
 _Span = Annotated[float, within(0.0, 1e5, "s")]
 DelaySetting = Annotated[float, within(-10.0, 10.0, "s")] | Literal["estimate"]
@@ -88,7 +87,7 @@ class SignalSettings:
     joint_delay_s: DelaySetting = "estimate"
     delay_search_s: Annotated[float, within(0.0, 10.0, "s", above=True)] = 0.1
     stiffness_nm_rad: tuple[Annotated[float, within(0.0, 1e12, "Nm/rad", above=True)], ...] | None = None
-    encoder: Encoder | None = None
+    encoder: EncoderSide | None = None
     coupled: tuple[tuple[Name, Name], ...] = ()
 
     def __post_init__(self) -> None:

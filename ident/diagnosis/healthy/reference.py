@@ -29,7 +29,8 @@ from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.rows.nominal_arm import GAIN_STD
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import LINK_FRICTION, PER_LINK, split_name
-from ident.effects import EFFECTS, EncoderSide, find_effect
+from ident.dynamics.structure import EncoderSide
+from ident.effects import EFFECTS, find_effect
 from ident.estimators.estimate import fisher_limit
 from ident.model import DynamicModel, write_model
 

@@ -20,7 +20,7 @@ from ident.diagnosis.rows.nominal_arm import STATED_WITHIN, NominalArm
 from ident.diagnosis.rows.recording import SessionRecord
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.base_set import BaseSet
-from ident.effects import EncoderSide
+from ident.dynamics.structure import EncoderSide
 from ident.rows.delay import Delay
 from lwr_driver.session import Session
 

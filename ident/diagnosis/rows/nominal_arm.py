@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.structure import Coupling
-from ident.effects import PRESLIDING, SENSOR_GAIN, EncoderSide, entry_of
+from ident.dynamics.structure import Coupling, EncoderSide
+from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of
 from ident.effects.motion import dahl
 from ident.rows.encoder_side import USUAL_TWIST_RAD
 
