@@ -29,8 +29,8 @@ from ident.diagnosis.settings import DiagnosisSettings
 from ident.diagnosis.verdict.late_channels import late_by_themselves
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
-from ident.dynamics.structure import Condition, ModelStructure
-from ident.effects import EFFECTS, EncoderSide, Shape
+from ident.dynamics.structure import Condition, EncoderSide, ModelStructure
+from ident.effects import EFFECTS, Shape
 from ident.model import DynamicModel
 from ident.rows.delay import Delay
 from ident.rows.filters import SignalSettings
