@@ -15,10 +15,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import stdtr
 
 from ident.dynamics.parameters import Floats
-from ident.rows.class_rows import LEAST, ByClass, away, error, fit
+from ident.rows.class_rows import LEAST, ByClass, Masks, away, error, fit
 from ident.rows.filters import SignalSettings
 
 USUAL_TWIST_RAD = 0.008
@@ -68,34 +69,53 @@ def at_motors(
         usual = efforts / USUAL_TWIST_RAD
     else:
         return None
+    links = _Side.of(rows, settings)
     tried = []
     for factor in factors:
         stiffness = tuple((factor * usual).tolist())
-        one = replace(settings, encoder="motor", stiffness_nm_rad=stiffness)
-        tried.append(_against(rows, settings, rows_of(one), one))
+        tried.append(_against(links, rows_of, replace(settings, encoder="motor", stiffness_nm_rad=stiffness)))
     return max(tried, key=lambda found: found.fall)
 
 
-def _against(links: ByClass, settings: SignalSettings, motors: ByClass, at_motor: SignalSettings) -> AtMotors:
-    """Positions of the motors against those of the links."""
-    used = [away(links, settings), away(motors, at_motor)]
-    fitted = [fit(links, used[0]), fit(motors, used[1])]
-    fall = error(links, fitted[0], used[0]) - error(motors, fitted[1], used[1])
+class _Side(NamedTuple):
+    """Rows with the positions of one side, those in use, the parameters (p,) fitted to their even blocks, and the mean
+    log of the held-back residual."""
+
+    rows: ByClass
+    used: Masks
+    values: Floats
+    error: float
+
+    @classmethod
+    def of(cls, rows: ByClass, settings: SignalSettings) -> _Side:
+        """The rows by these settings."""
+        used = away(rows, settings)
+        values = fit(rows, used)
+        return cls(rows, used, values, error(rows, values, used))
+
+    def squares(self, key: tuple[str, int], where: NDArray[np.bool_]) -> Floats:
+        """Squares of some residuals of a joint and side."""
+        own = self.rows[key]
+        return np.asarray((own.torque - own.fitted(self.values))[where] ** 2)
+
+
+def _against(
+    links: _Side, rows_of: Callable[[SignalSettings], ByClass], settings: SignalSettings
+) -> AtMotors:
+    """Positions of the motors, by the settings, against those of the links."""
+    motors = _Side.of(rows_of(settings), settings)
     less: dict[int, list[float]] = {}
-    for key, link in links.items():
-        motor = motors[key]
-        both = used[0][key] & used[1][key] & ~link.even
-        numbers, place, count = np.unique(link.block[both], return_inverse=True, return_counts=True)
-        squares = [
-            np.bincount(place, (own.torque - own.fitted(values))[both] ** 2) + 1e-300
-            for own, values in ((link, fitted[0]), (motor, fitted[1]))
-        ]
-        for number, many, change in zip(
-            numbers, count >= LEAST, np.log(squares[0] / squares[1]), strict=True
-        ):
+    for key, own in links.rows.items():
+        both = links.used[key] & motors.used[key] & ~own.even
+        numbers, place, count = np.unique(own.block[both], return_inverse=True, return_counts=True)
+        of_links, of_motors = (
+            np.bincount(place, side.squares(key, both)) + 1e-300 for side in (links, motors)
+        )
+        for number, many, change in zip(numbers, count >= LEAST, np.log(of_links / of_motors), strict=True):
             if many:
                 less.setdefault(int(number), []).append(0.5 * float(change))
-    return AtMotors(at_motor, motors, fall, _chance(np.array([np.mean(block) for block in less.values()])))
+    chance = _chance(np.array([np.mean(block) for block in less.values()]))
+    return AtMotors(settings, motors.rows, links.error - motors.error, chance)
 
 
 def _chance(less: Floats) -> float:
