@@ -151,8 +151,6 @@ def nearest_real(
 
     Raises ConfigurationError for wrong shapes, DataError without a solution.
     """
-    import clarabel
-
     bodies = np.atleast_2d(np.asarray(reference, dtype=np.float64))
     chi, c = np.asarray(base, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
     parts = [
@@ -181,30 +179,10 @@ def nearest_real(
     b = len(chi)
     # The bodies' own weight only chooses among those that are equally near.
     p = sparse.diags(np.concatenate([np.full(size, _TOUCH), np.zeros(m), np.ones(b)]))
-    a = sparse.vstack(
-        [
-            sparse.hstack([sparse.csc_matrix(columns), -sparse.identity(b)]),
-            -sparse.eye(size + m, size + m + b),
-        ],
-        format="csc",
-    )
-    identity = np.array([1.0 if i == j else 0.0 for i, j in _TRIANGLE])
-    right = np.concatenate([missing, np.tile(identity, len(bodies)), np.zeros(m)])
-    cones = [
-        clarabel.ZeroConeT(b),
-        *[clarabel.PSDTriangleConeT(4)] * len(bodies),
-        clarabel.NonnegativeConeT(m),
-    ]
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    found = clarabel.DefaultSolver(
-        sparse.csc_matrix(p), np.zeros(size + m + b), a, right, cones, settings
-    ).solve()
-    if str(found.status) not in ("Solved", "AlmostSolved"):
-        raise DataError(
-            f"no nearest bodies were found for these parameters ({found.status}); check the estimate"
-        )
-    x = np.array(found.x)
+    link = sparse.hstack([sparse.csc_matrix(columns), -sparse.identity(b)], format="csc")
+    x = _solve(p, link, missing, len(bodies), 0.0, m)
+    if x is None:
+        raise DataError("no nearest bodies were found for these parameters; check the estimate")
     residual = unit * x[size + m :]
     z, u = x[:size], x[size : size + m]
     values = [np.eye(4) + _matrix(one) for one in z.reshape(-1, 10)]
@@ -329,16 +307,24 @@ def _solve_nearest(slope: Floats, missing: Floats, bodies: int, margin: float, f
 
 
 def _solve(
-    p: sparse.spmatrix, rows: sparse.csc_matrix, target: Floats, bodies: int, margin: float
+    p: sparse.spmatrix,
+    rows: sparse.csc_matrix,
+    target: Floats,
+    bodies: int,
+    margin: float,
+    nonnegative: int = 0,
 ) -> Floats | None:
-    """min z' p z / 2 with rows z = target and 1 + mat(z) - margin 1 >= 0 of each body; None without any z."""
+    """min z' p z / 2 with rows z = target, 1 + mat(z) - margin 1 >= 0 of each body, and z >= 0 in as many entries
+    behind the bodies' as `nonnegative`; None without any z."""
     import clarabel
 
     size, columns = 10 * bodies, rows.shape[1]
     identity = np.array([1.0 if i == j else 0.0 for i, j in _TRIANGLE])
-    a = sparse.vstack([rows, -sparse.eye(size, columns)], format="csc")
-    b = np.concatenate([target, np.tile((1.0 - margin) * identity, bodies)])
+    a = sparse.vstack([rows, -sparse.eye(size + nonnegative, columns)], format="csc")
+    b = np.concatenate([target, np.tile((1.0 - margin) * identity, bodies), np.zeros(nonnegative)])
     cones = [clarabel.ZeroConeT(len(target)), *[clarabel.PSDTriangleConeT(4)] * bodies]
+    if nonnegative:
+        cones.append(clarabel.NonnegativeConeT(nonnegative))
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_iter = 200
