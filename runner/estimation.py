@@ -169,13 +169,6 @@ def check_spans(
             raise ConfigurationError(f"{place}: `{keys[0]}`: `{keys[1]}`: {said}")
 
 
-def recorded_couplings(sessions: Sequence[Session]) -> tuple[str, ...]:
-    """Coupled pairs of joints in the metadata of imported sessions, each as `A5:A6`."""
-    return tuple(
-        dict.fromkeys(pair for one in sessions for pair in one.metadata.get("couplings", "").split())
-    )
-
-
 def announced(
     sessions: Sequence[Session], payloads: Sequence[str], typed: Sequence[Path] = ()
 ) -> list[Session]:

@@ -35,7 +35,7 @@ from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
 from ident.rows.observation import stack
 from ident.rows.prepared import PreparedSession
-from ident.rows.sessions import payload_name, require
+from ident.rows.sessions import payload_name, recorded_couplings, require
 from ident.rows.shared_rows import marks
 from ident.rows.signal_choice import choose_signals
 from ident.screening.doubts import Doubt, doubted_joints, explaining, late_positions, settle
@@ -458,8 +458,7 @@ def known_settings(
     elif all(session.motor is None for session in read):
         settings = replace(settings, model=1)
     if not settings.couplings:
-        pairs = dict.fromkeys(pair for one in read for pair in one.metadata.get("couplings", "").split())
-        settings = replace(settings, couplings=tuple(Coupling.of(pair) for pair in pairs))
+        settings = replace(settings, couplings=tuple(map(Coupling.of, recorded_couplings(read))))
     arm = known_arm(chain)
     if arm is not None and settings.signals.stiffness_nm_rad is None:
         signals = replace(settings.signals, stiffness_nm_rad=tuple(arm.stiffness.tolist()))

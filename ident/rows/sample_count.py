@@ -9,6 +9,7 @@ import numpy as np
 from ident.dynamics.parameters import Floats
 from ident.rows.data_quality import stale
 from ident.rows.filters import median_step
+from ident.rows.prepare import clock_ns
 from ident.rows.sample_clock import sample_clock
 from ident.rows.timebase import missing_samples
 from lwr_driver.session import JointColumns
@@ -25,8 +26,8 @@ class SampleCount:
 
 def sample_count(joint: JointColumns) -> SampleCount:
     """The counts of an estimate (`prepare`), by the same clock."""
-    clock_ns = joint.publish_time if np.ptp(joint.publish_time) > 0 else joint.log_time
-    stamps: Floats = np.asarray((clock_ns - clock_ns[:1]) * 1e-9, dtype=np.float64)
+    times_ns = clock_ns(joint)
+    stamps: Floats = np.asarray((times_ns - times_ns[:1]) * 1e-9, dtype=np.float64)
     if len(stamps) < 2:
         return SampleCount(0, 0)
     clock = sample_clock(stamps, joint.position)

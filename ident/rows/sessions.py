@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from fri.errors import ConfigurationError, DataError
@@ -31,3 +32,10 @@ def stated_mass(session: Session) -> float | None:
         raise DataError(
             f"{session.path.name}: `payload_mass` {stated!r} in the metadata is no number"
         ) from error
+
+
+def recorded_couplings(sessions: Sequence[Session]) -> tuple[str, ...]:
+    """Coupled pairs of joints in the metadata of imported sessions, each as `A5:A6`."""
+    return tuple(
+        dict.fromkeys(pair for one in sessions for pair in one.metadata.get("couplings", "").split())
+    )

@@ -87,11 +87,11 @@ def command(
     from ident.dynamics.known_arm import known_arm
     from ident.import_log import read_recording
     from ident.model.model_file import read_model
+    from ident.rows.sessions import recorded_couplings
     from runner.diagnosis import arm_data, asked, chain_of, study
     from runner.diagnosis.discriminating import offers_after_logs
     from runner.diagnosis.study import replaceable
     from runner.ending import compared, of_diagnosis
-    from runner.estimation import recorded_couplings
     from runner.replay import attached_experiment
     from runner.report.page import write_diagnosis_report
     from runner.status import StatusLine
