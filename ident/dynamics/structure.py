@@ -49,6 +49,7 @@ from ident.dynamics.regressor import check_states, fill_rigid
 
 Side = Literal["motor", "joint", "difference"]
 EncoderSide = Literal["link", "motor"]
+"""The side of an elastic joint that its positions are of."""
 MODEL_SIDES: dict[int, tuple[Side, ...]] = {1: ("joint",), 2: ("motor", "joint"), 3: ("difference",)}
 
 _JOINT_TERMS = frozenset(LINK_FRICTION)

@@ -25,7 +25,6 @@ from ident.effects.motion import ArmMotion, Floats
 from ident.effects.words import Values, quantity, spoken
 
 EffectSide = Literal["motor", "joint", "sensor", "timing"]
-"""The side of an elastic joint that its positions are of."""
 Variable = Literal["velocity", "load", "position", "time", "motor angle"]
 Parameters = Mapping[str, float]
 """Values by the names of an effect's parameters, SI units."""

@@ -360,10 +360,10 @@ def _diagnosis(results: ResultFolder) -> Verdict | None:
         return None
     level, text = in_short(diagnosis, results.joint_names)
     if text.startswith(NOTHING):
-        # What is left without a cause is a part of the answer.
-        # Its records come with those of a replay, and a replay with the physics.
+        # On use: it comes with the records of a replay, and these with the physics.
         from runner.report.diagnosis import DiagnosisFolder
 
+        # What is left without a cause is a part of the answer.
         folder = DiagnosisFolder.of(results)
         assert folder is not None
         level, text = folder.statements.level, folder.statements.headline + text.removeprefix(NOTHING)
