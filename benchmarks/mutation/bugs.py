@@ -250,7 +250,7 @@ BUGS: tuple[Bug, ...] = (
     ),
     Bug(
         "an angle that wraps stays so at import",
-        "ident/import_log/conversion.py",
+        "ident/import_log/channels.py",
         "        values, wraps = unwrapped(values)\n",
         "        pass\n",
         (

@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from ident.import_log.conversion import ImportReport, import_log
+from ident.import_log.conversion import import_log
 from ident.import_log.direct import read_recording
 from ident.import_log.guess import Guess, Known, guess_mapping
 from ident.import_log.mapping import (
@@ -20,6 +20,7 @@ from ident.import_log.mapping import (
     mapping_path,
 )
 from ident.import_log.periods import Periods, find_periods
+from ident.import_log.report import ImportReport
 
 __all__ = [
     "Coupling",

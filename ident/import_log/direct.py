@@ -15,7 +15,8 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.session_chain import AS_RECORDED
 from ident.dynamics.urdf import Urdf, read_urdf
 from ident.import_log.bag import Bag, bag_files, read_bag
-from ident.import_log.conversion import MOST_MISSING, import_log
+from ident.import_log.channels import MOST_MISSING
+from ident.import_log.conversion import import_log
 from ident.import_log.mapping import LogMapping, Signal, TimeBase, Unit
 from ident.import_log.rests import rests, without_gripper
 from lwr_driver.session import Session, read_session

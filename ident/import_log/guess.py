@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.urdf import Urdf, read_urdf
+from ident.import_log.channels import MOST_MISSING
 from ident.import_log.clock import Clocks, in_rows
-from ident.import_log.conversion import MOST_MISSING
 from ident.import_log.fields import Field, fields
 from ident.import_log.mapping import LogMapping, Signal, Transmission, Unit
 from ident.import_log.rates import Rates, compare
