@@ -708,19 +708,28 @@ class Interpreter:
         if self.program.finished:
             return _LONG
         due_ms = self.program.due_ms
-        idle = max(math.ceil((due_ms - _DUE_MS - self._now_ms) / milliseconds), 0)
+        wait = max(math.ceil(due_ms - _DUE_MS - self._now_ms), 0)
         # Against rounding: the very comparison of `run`.
-        while idle and due_ms <= self._now_ms + (idle - 1) * milliseconds + _DUE_MS:
-            idle -= 1
-        return idle
+        while wait and due_ms <= self._now_ms + wait - 1 + _DUE_MS:
+            wait -= 1
+        return wait // milliseconds
 
     def skip(self, milliseconds: int) -> None:
         """Let `milliseconds` pass without a statement."""
         self._now_ms += milliseconds
 
     def advance(self, milliseconds: int) -> None:
-        """Let `milliseconds` pass, between two cycles; runs the statements due."""
+        """Let the `milliseconds` of a cycle pass, between two cycles; runs the statements due."""
+        for _ in range(milliseconds):
+            self.millisecond()
+        self.drive()
+
+    def millisecond(self) -> None:
+        """Run the statements due in the coming millisecond of the cycle."""
         if not self.program.finished:
             self.program.run(self.session, self._now_ms)
-        self._now_ms += milliseconds
+        self._now_ms += 1
+
+    def drive(self) -> None:
+        """Give the session KRL's setpoint for the next cycle, during a motion."""
         self.program.drive(self.session, self._now_ms + self.session.sample_time_ms)

@@ -72,6 +72,8 @@ class Cabinet:
         self.controller = PositionController(config.controller)
         self.krl_reals = KrlReals(config.krl_reals, self.joints)
         self.currents: np.ndarray | None = np.zeros(self.joints) if config.krl.currents else None
+        # Currents of the milliseconds since the KRL program ran.
+        self._measured: list[np.ndarray] = []
         self.journal = Journal()
         self.mode: str = config.fri.mode
         self._springs = np.array([[1000.0], [0.7]]) * np.ones((2, self.joints))
@@ -352,13 +354,22 @@ class Cabinet:
         self.cycle += 1
 
     def _run_program(self, milliseconds: int) -> None:
-        """Let the KRL program run; an error stops it, as on the controller."""
+        """Let the KRL program run; an error stops it, as on the controller.
+
+        Each statement reads the motor currents of its own millisecond. Read at the end of the cycle, all would be at
+        one phase of the ripple that the setpoints between two commands leave in them.
+        """
+        measured, self._measured = self._measured, []
         self.journal.time_s = self.milliseconds * CYCLE_S
         if self.interpreter is None:
             return
         running = self.running
         try:
-            self.interpreter.advance(milliseconds)
+            for number in range(milliseconds):
+                if measured:
+                    self.currents = measured[number - milliseconds]
+                self.interpreter.millisecond()
+            self.interpreter.drive()
         except LwrError as error:
             self.journal.warn(f"KRL program stopped: {error}")
             self.stop_program()
@@ -421,7 +432,7 @@ class Cabinet:
         """The measured motor torque of a millisecond, to the KRL program or to the loop that stands for one."""
         if self.program_name not in PUBLISHED:
             if self.currents is not None:
-                self.currents = self.krl_reals.late(motor_torque)
+                self._measured.append(self.krl_reals.late(motor_torque).copy())
         elif self.config.krl_reals.enabled:
             self.krl_reals.millisecond(motor_torque, self.session.to_real, self.session.to_int)
 

@@ -234,15 +234,15 @@ def test_command_mode_with_drives_off_is_granted(name):
 
 
 @pytest.mark.parametrize(
-    ("period_ms", "calls", "ticks"), [(1, 120, 10), (5, 24, 10), (12, 10, 10), (50, 12, 46), (100, 6, 42)]
+    ("period_ms", "calls", "ticks"), [(1, 120, 10), (5, 24, 10), (12, 10, 10), (50, 12, 50), (100, 6, 50)]
 )
 def test_interpreter_ticks_every_12_ms(period_ms, calls, ticks):
-    # A tick falls due at 0, 12, 24, ... ms; a call runs those due at its beginning.
+    # A tick falls due at 0, 12, 24, ... ms; a call runs those due in its milliseconds.
     session = Rig().session
     interpreter = Interpreter(session, KrlProgram(COUNTING))
     for _ in range(calls):
         interpreter.advance(period_ms)
-    assert session.to_int[0] == (calls - 1) * period_ms // 12 + 1 == ticks
+    assert session.to_int[0] == (calls * period_ms - 1) // 12 + 1 == ticks
 
 
 def test_a_variable_holds_between_two_ticks():

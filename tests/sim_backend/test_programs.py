@@ -157,6 +157,37 @@ def test_without_motor_currents_the_program_runs_and_the_counter_stands() -> Non
     assert own.cabinet.session.to_real[11] == pytest.approx(12.0, abs=0.2)
 
 
+@pytest.mark.parametrize("period_ms", [1, 2, 5, 12, 30])
+def test_a_statement_reads_the_motor_currents_of_its_own_millisecond(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, period_ms: int
+) -> None:
+    body = f"""DECL FRISTATE r
+INT n
+r=friOpen({period_ms})
+LOOP
+n=n+1
+$FRI_TO_REA[n]=$CURR_ACT[1]
+WAIT SEC 0.012
+ENDLOOP"""
+    noise = {"sensors.motor_torque_noise": [1.0] * 7, "sensors.motor_torque_resolution": [0.0] * 7}
+    settings = {"krl.statement_ms": 0.0, **noise}
+    machine = cabinet(**settings, **{"fri.program": str(write(tmp_path, body))})
+    told: list[float] = []
+    publish = machine.publish
+
+    def listen(motor_torque: np.ndarray) -> None:
+        told.append(motor_torque[0])
+        publish(motor_torque)
+
+    monkeypatch.setattr(machine, "publish", listen)
+    while len(told) < 120:
+        if machine.session.state is not State.OFF:
+            machine.packet()
+        machine.close()
+    assert len(set(told)) == len(told)
+    assert machine.session.to_real[:10].tolist() == np.float32(told[:120:12]).tolist()
+
+
 def test_the_mounting_is_put_in_force_by_the_program() -> None:
     ceiling = {"robot.gravity": [0.0, 0.0, 9.81], "krl.variables": {"LWR_MOUNTING": True, "LWR_GZ": -9.81}}
     own = Own(**ceiling)
