@@ -8,8 +8,8 @@ kinds a motor channel late by 5 ms. Model 2 is identified with the settings as t
 description (10 kNm/rad for all joints; the emulated ones have 6 to 15), and held against the emulator's parameters.
 
 With slower FRI cycles the controller interpolates between two commands; the motor torque then has a ripple of that
-period which grows with the acceleration, and samples at one phase of it see a drive inertia one per cent too large:
-`--cycle-ms 4` shows it.
+period which grows with the acceleration. The KRL loop ticks every 12 ms: with a cycle of 5 ms its samples are at all
+phases of the ripple, but with 4 ms at one, where they see a drive inertia one per cent too large. `--cycle-ms` shows it.
 """
 
 from __future__ import annotations
