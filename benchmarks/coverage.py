@@ -9,7 +9,7 @@ description (10 kNm/rad for all joints; the emulated ones have 6 to 15), and hel
 
 With slower FRI cycles the controller interpolates between two commands; the motor torque then has a ripple of that
 period which grows with the acceleration. The KRL loop ticks every 12 ms: with a cycle of 5 ms its samples are at all
-phases of the ripple, but with 4 ms at one, where they see a drive inertia one per cent too large. `--cycle-ms` shows it.
+phases of the ripple, with 4 ms at one, where they see a drive inertia one per cent too large: `--cycle-ms 4` shows it.
 """
 
 from __future__ import annotations
