@@ -21,16 +21,19 @@ from numpy.typing import NDArray
 
 from fri.handshake import IdentificationHandshake, find_handshake
 from fri.in_process import Network
-from fri.packets import CMD, raw
-from fri.remote import LinkEvent, RemoteEnd
+from fri.packets import CMD
+from fri.remote import RemoteEnd
 from fri.states import ALL_DRIVES, Quality, State
 from fri.states import Control as ControlMode
 from lwr_driver.arm import JOINTS, ArmLimits
 from lwr_driver.commander import Commander
 from lwr_driver.contact import Contact, ContactWatch, Stale, WatchAhead
-from lwr_driver.control import BIN_NS, HISTORY, HISTORY_STEP, Control, Job, Mode, Result, Text, Word
+from lwr_driver.control import Control, Job, Mode, Result, Text, Word
+from lwr_driver.cycle_rows import CycleRows
+from lwr_driver.means import CycleMeans
 from lwr_driver.pace import Pace, Stamps
-from lwr_driver.ring import ROW, Ring
+from lwr_driver.ring import Ring
+from lwr_driver.setpoint import SetpointHistory
 
 if TYPE_CHECKING:
     from lwr_driver.turnaround import Turnaround
@@ -51,7 +54,6 @@ _RING_SHARE = 4
 _WATCHED = ("msr_jnt_pos", "msr_jnt_trq", "est_ext_jnt_trq", "gravity")
 _NOBODY_S = 1.0  # a motion goes on so long without a sign of life of the driver's process
 _REMIND_S = 1.0  # silence in lock step before a reminder to the other side
-_STILL_RAD = 1e-5  # largest step per cycle of a set point at rest
 # A motion ends after so many packets of quality UNACCEPTABLE in command mode, or so long below OK.
 _UNACCEPTABLE_PACKETS, _BAD_S = 3, 1.0
 # Counters of the link in a reason, with their words.
@@ -63,8 +65,6 @@ _REPORTED = (
     ("foreign", "foreign"),
     ("ahead", "ahead of their time by the sender's fault"),
 )
-_COUNTED = ("lost", "repeated", "reordered", "suspect", "malformed", "foreign", "restarts", "unreflected")
-_COUNTERS = tuple((Word[name.upper()], name) for name in (*_COUNTED, "answered", "received"))
 
 
 @dataclass(frozen=True)
@@ -80,44 +80,6 @@ class LoopSettings:
     tracking_limit_rad: float
     joint_names: tuple[str, ...]
     torque_sign: tuple[float, ...] = (1.0,) * JOINTS
-
-
-class Rest:
-    """Means over some cycles; sums of deviations from the first one, against rounding."""
-
-    def __init__(self, remote: RemoteEnd) -> None:
-        msr = remote.msr
-        self._values = (
-            msr["msr_jnt_pos"],
-            msr["msr_jnt_trq"],
-            msr["est_ext_jnt_trq"],
-            remote.command["jnt_pos"],
-        )
-        self._count = 0
-        self._first = np.zeros((4, JOINTS))
-        self._sum, self._squares = np.zeros((4, JOINTS)), np.zeros((4, JOINTS))
-
-    def add(self, *, first: bool) -> int:
-        """Include the present cycle, restarting with the `first`; returns the number of cycles."""
-        if first:
-            self._count = 0
-            self._sum[:] = self._squares[:] = 0.0
-            for place, value in enumerate(self._values):
-                self._first[place] = value
-        for place, value in enumerate(self._values):
-            deviation = value - self._first[place]
-            self._sum[place] += deviation
-            self._squares[place] += deviation * deviation
-        self._count += 1
-        return self._count
-
-    def write(self, measured: NDArray[np.float64]) -> None:
-        """Fill (6, 7): mean q, std q, mean tau, std tau, mean external tau, mean command."""
-        mean = self._sum / self._count
-        std = np.sqrt(np.maximum(self._squares / self._count - mean**2, 0.0))
-        mean += self._first
-        measured[0], measured[1], measured[2], measured[3] = mean[0], std[0], mean[1], std[1]
-        measured[4], measured[5] = mean[2], mean[3]
 
 
 class Loop:
@@ -166,9 +128,7 @@ class Loop:
         self._silence_s, self._silence_cycles = settings.link_timeout_s, 0
         self._sequence = self._count = -1  # of packets, and of the cycles they took
         self._stamps = Stamps()
-        unknown = np.full(JOINTS, np.nan, dtype=np.float32)
-        self._past_setpoints = [(unknown, 1)] * 3  # newest first, and the cycles to the one before
-        self._limits, self._fastest = limits, limits.v_max
+        self._setpoints = SetpointHistory(limits)
         self._doubted = self._held_back = False
         self._let_brake = 0  # cycles of a moving set point left to the controller
         self._misses, self._misses_before, self._missed_at = 0, 0, -_FEWEST_CYCLES
@@ -176,7 +136,6 @@ class Loop:
         self._heard_s = self._reminded_s = time.monotonic()
         self._answered = False
         self._restarts = 0
-        self._last_event: LinkEvent | None = None
         self._offered_ns = 0
         self._looked: WatchAhead | None = None  # at accepted packets not taken yet
 
@@ -185,12 +144,8 @@ class Loop:
         self._a = self._b = self._limit = 0  # its arguments
         self._job_cycles = self._run_length = 0
         self._begun = False
-        self._rest = Rest(self.remote)
-        self._row: NDArray[Any] = np.zeros(1, dtype=ROW) if ring is None else ring.row
-        self._row_bytes = _bytes(self._row)
-        self._fields = {name: self._row[name] for name in ROW.names or () if name not in ("msr", "cmd")}
-        self._msr_bytes, self._cmd_bytes = _bytes(msr), _bytes(self.remote.command)
-        self._msr_place, self._cmd_place = _place("msr"), _place("cmd")
+        self._means = CycleMeans(self.remote)
+        self._rows = CycleRows(self.remote, self._commander, control, ring, lock_step=settings.lock_step)
 
     @property
     def mode(self) -> Mode:
@@ -258,10 +213,10 @@ class Loop:
         answered = self._commander.mode is not Mode.SILENT and not self._held_back
         if answered:
             remote.answer(target, insist=self._doubted, sent=sent)
-        if turnaround is not None and sent and turnaround.answer_bytes != self._cmd_bytes:
+        if turnaround is not None and sent and turnaround.answer_bytes != self._rows.command_bytes:
             self._disagree()
         self._answered = answered or sent
-        self._write_row(self._answered, turnaround.sent_ns if turnaround is not None and sent else None)
+        self._rows.write(self._answered, turnaround.sent_ns if turnaround is not None and sent else None)
         self._advance_job(max(elapsed, 1))
         return True
 
@@ -336,15 +291,12 @@ class Loop:
         words[Word.HEARD_NS] = self.remote.received_ns
         sent_ns = time.monotonic_ns()
         # Together they took this time, each a share of it.
-        share_ns = (sent_ns - self._offered_ns) // count
-        self._control.latency[min(share_ns // BIN_NS, len(self._control.latency) - 1)] += count
-        self._write_rows(before + 1, first_index, packets, commands)
+        self._rows.count_latency((sent_ns - self._offered_ns) // count, count)
+        self._rows.write_many(before + 1, first_index, packets, commands)
 
     def _note_packets(self, packets: NDArray[Any]) -> None:
         """Set points and time stamps of plain successors, as far as later packets are compared with them."""
-        setpoints = (packets["cmd_jnt_pos"] + packets["cmd_jnt_pos_fri_offset"])[-3:]
-        past = [(setpoint.copy(), 1) for setpoint in setpoints[::-1]]
-        self._past_setpoints = [*past, *self._past_setpoints][:3]
+        self._setpoints.add_packets(packets)
         for stamp in packets["timestamp"][-2:].tolist():
             self._stamps.feed(1, stamp, self._sample_time)
 
@@ -480,30 +432,10 @@ class Loop:
         remote, commander = self.remote, self._commander
         self._held_back = False
         self._heard_s = remote.received_ns * 1e-9
-        ready = (
-            remote.state == State.CMD
-            and remote.power == ALL_DRIVES
-            and remote.error == 0
-            and remote.control == ControlMode.POSITION
-        )
         setpoint = self._krl + self._offset
-        past = self._past_setpoints
         early, elapsed = elapsed == 0, max(elapsed, 1)
-        past[2], past[1], past[0] = past[1], past[0], (setpoint, elapsed)
-        if remote.restarts != self._restarts:
-            self._restarts = remote.restarts
-            self._reset_pace()
-            # The restart has cleared the request to start; it is made anew.
-            self._begun = self._begun and self._job is not Job.START
-            self._lose("the controller was started again")
-        elif elapsed > self._silence_cycles:
-            self._lose(f"{elapsed - 1} packets in a row were lost")
-        other_cycle = remote.sample_time_s != self._sample_time
-        self._doubted = (other_cycle or not ready) and self._doubtful()
-        if self._doubted:
-            other_cycle, ready = False, True
-        if other_cycle:
-            self._set_period(remote.sample_time_s)
+        self._setpoints.add(setpoint, elapsed)
+        ready = self._check_link(elapsed)
         if not sent:
             self._take_request()
         touched = self._feel(elapsed)
@@ -515,21 +447,11 @@ class Loop:
         if not ready:
             self._leave()
             if remote.commanding:
-                step = self._step()
+                step = self._setpoints.step()
                 self._held_back = step is None or bool(step.any())
             return None
         if commander.mode is Mode.MIRROR:
-            step = self._step()
-            if step is None or (step.any() and not self._may_stop(setpoint, elapsed)):
-                self._held_back = True
-                return None
-            self._let_brake = self._unacceptable = self._bad = 0
-            self._alarm = None
-            if self._watch is not None:
-                self._watch.weigh()
-            self._misses_before = misses
-            self._counted_before = remote.counters()
-            return commander.enter(setpoint, float(remote.msr["safety_limits"]), step)
+            return self._enter(setpoint, elapsed)
         if early and (commander.moving or self._job is Job.MOTION):
             # Without an answer a controller that is too fast brakes by itself; no row is due yet.
             self._held_back = True
@@ -548,6 +470,46 @@ class Loop:
             elif self._job is not Job.MOTION:
                 commander.stop(Result.ABORTED, f"stopped by the driver {commander.place()}")
         return commander.command(self._count)
+
+    def _check_link(self, elapsed: int) -> bool:
+        """Notice a restart, a gap and another sample time; whether the controller takes commands.
+
+        A packet in doubt, see `_doubtful`, is taken for one that takes commands.
+        """
+        remote = self.remote
+        if remote.restarts != self._restarts:
+            self._restarts = remote.restarts
+            self._reset_pace()
+            # The restart has cleared the request to start; it is made anew.
+            self._begun = self._begun and self._job is not Job.START
+            self._lose("the controller was started again")
+        elif elapsed > self._silence_cycles:
+            self._lose(f"{elapsed - 1} packets in a row were lost")
+        ready = (
+            remote.state == State.CMD
+            and remote.power == ALL_DRIVES
+            and remote.error == 0
+            and remote.control == ControlMode.POSITION
+        )
+        other_cycle = remote.sample_time_s != self._sample_time
+        self._doubted = (other_cycle or not ready) and self._doubtful()
+        if other_cycle and not self._doubted:
+            self._set_period(remote.sample_time_s)
+        return ready or self._doubted
+
+    def _enter(self, setpoint: NDArray[np.float32], elapsed: int) -> NDArray[np.float32] | None:
+        """The first position in command mode; None, held back, while the controller's set point must not be stopped."""
+        step = self._setpoints.step()
+        if step is None or (step.any() and not self._may_stop(setpoint, elapsed)):
+            self._held_back = True
+            return None
+        self._let_brake = self._unacceptable = self._bad = 0
+        self._alarm = None
+        if self._watch is not None:
+            self._watch.weigh()
+        self._misses_before = self._misses
+        self._counted_before = self.remote.counters()
+        return self._commander.enter(setpoint, float(self.remote.msr["safety_limits"]), step)
 
     def _feel(self, elapsed: int) -> Contact | None:
         """Torque or contact beyond its limit in this packet."""
@@ -615,21 +577,6 @@ class Loop:
         where = self._commander.place()
         return f"the controller's packets run ahead of time {where}: {self.pace}; see its friOpen"
 
-    def _step(self) -> NDArray[np.float64] | None:
-        """Step of the controller's set point per cycle (7,) [rad], zero at rest; None if unknown.
-
-        It is unknown at the first two packets, and if one of the last may be damaged: the steps must agree
-        within the acceleration limits.
-        """
-        (now, cycles), (before, cycles_before), (first, _) = self._past_setpoints
-        step = (now - before).astype(np.float64) / cycles
-        if float(np.abs(step).max()) <= _STILL_RAD:
-            return np.zeros(JOINTS)
-        change = np.abs(step - (before - first) / cycles_before)
-        room = self._limits.a_max * self._period**2 * (cycles + cycles_before) / 2.0 + _STILL_RAD
-        # Also false for NaN.
-        return step if np.all(change <= room) and np.all(np.abs(step) <= self._fastest) else None
-
     def _may_stop(self, setpoint: NDArray[np.float32], elapsed: int) -> bool:
         """Whether commands shall stop a set point still moving after a loss of command mode.
 
@@ -655,7 +602,8 @@ class Loop:
         self._period = round(sample_time_s * 1e6) * 1e-6
         self._silence_s = max(self._settings.link_timeout_s, _FEWEST_CYCLES * self._period)
         self._silence_cycles = round(self._silence_s / self._period)
-        self._fastest = self._limits.v_max * self._period
+        self._setpoints.set_period(self._period)
+        self._rows.period_s = self._period
         self._commander.set_period(self._period)
         if self._watch is not None:
             self._watch.set_period(self._period)
@@ -710,7 +658,7 @@ class Loop:
         if self._ring is not None:
             self._ring.beat(round(now * 1e9))
         self._take_request()
-        self._publish_counters()
+        self._rows.publish_counters()
         self._words[Word.MODE] = int(self._commander.mode)
         if self._commander.mode is Mode.SILENT and self._job in (Job.MOTION, Job.HALT):
             self._finish(
@@ -754,7 +702,7 @@ class Loop:
         self._job_cycles += elapsed
         done = False
         if job is Job.CYCLES:
-            done = self._rest.add(first=self._run_length == 0) >= self._a
+            done = self._means.add(first=self._run_length == 0) >= self._a
             self._run_length += 1
         elif job is Job.QUALITY:
             self._run_length = self._run_length + 1 if remote.quality >= self._b else 0
@@ -794,86 +742,8 @@ class Loop:
 
     def _finish(self, result: Result, reason: str) -> None:
         if self._job is Job.CYCLES and self._run_length > 0:
-            self._rest.write(self._control.measured)
+            self._means.write(self._control.measured)
         self._control.write_text(Text.REASON, reason)
         self._words[Word.RESULT] = int(result)
         self._words[Word.DONE] = self._request
         self._job = Job.NONE
-
-    # -- rows ------------------------------------------------------------------------------------------------
-
-    def _write_row(self, answered: bool, sent_ns: int | None) -> None:
-        """The row of this cycle; sent_ns : when the answer was sent, None for just now [ns]."""
-        remote, words, fields, control = self.remote, self._words, self._fields, self._control
-        received_ns = remote.received_ns
-        sent_ns = time.monotonic_ns() if sent_ns is None else sent_ns
-        words[Word.HEARD_NS] = received_ns
-        if answered:
-            control.latency[min((sent_ns - received_ns) // BIN_NS, len(control.latency) - 1)] += 1
-        if self._settings.lock_step:
-            # In lock step the log uses the controller's clock: the same run gives the same log.
-            received_ns = sent_ns = remote.sequence * round(self._period * 1e9)
-        fields["t_recv"][0] = received_ns
-        fields["t_send"][0] = sent_ns if answered else 0
-        fields["sequence"][0] = remote.sequence
-        fields["plan_index"][0] = self._commander.index
-        fields["phase"][0] = self._commander.phase
-        fields["answered"][0] = answered
-        self._row_bytes[self._msr_place] = self._msr_bytes
-        self._row_bytes[self._cmd_place] = self._cmd_bytes
-        if self._ring is not None:
-            self._ring.publish()
-            self._ring.beat(time.monotonic_ns())
-        cycles = int(words[Word.CYCLES])
-        start = cycles % HISTORY * ROW.itemsize
-        control.history_bytes[start : start + ROW.itemsize] = self._row_bytes
-        words[Word.CYCLES] = cycles + 1
-        index = self._commander.index
-        words[Word.MODE], words[Word.INDEX] = int(self._commander.mode), index
-        if index >= 0:
-            words[Word.ROW] = index
-        self._publish_counters()
-
-    def _write_rows(self, sequence: int, index: int, packets: NDArray[Any], commands: NDArray[Any]) -> None:
-        """The rows of plain packets from number `sequence` on, answered with the rows of the motion from `index` on."""
-        control, words, count = self._control, self._words, np.arange(len(packets))
-        rows = np.zeros(len(packets), dtype=ROW)
-        rows["sequence"] = sequence + count
-        rows["t_recv"] = rows["t_send"] = rows["sequence"] * round(self._period * 1e9)
-        rows["plan_index"], rows["phase"] = index + count, self._commander.phase
-        rows["answered"] = 1
-        content = raw(rows)
-        content[:, self._msr_place], content[:, self._cmd_place] = raw(packets), raw(commands)
-        if self._ring is not None:
-            self._ring.publish_rows(rows)
-            self._ring.beat(time.monotonic_ns())
-        history = raw(control.history)
-        for start in range(0, len(rows), HISTORY_STEP):
-            some = content[start : start + HISTORY_STEP]
-            cycles = int(words[Word.CYCLES])
-            history[(cycles + np.arange(len(some))) % HISTORY] = some
-            words[Word.CYCLES] = cycles + len(some)
-        words[Word.MODE] = int(self._commander.mode)
-        words[Word.INDEX] = words[Word.ROW] = self._commander.index
-        self._publish_counters()
-
-    def _publish_counters(self) -> None:
-        """Write counters and the last note of the link into the shared memory."""
-        remote, words = self.remote, self._words
-        for word, name in _COUNTERS:
-            words[word] = getattr(remote, name)
-        if remote.events and remote.events[-1] is not self._last_event:
-            self._last_event = remote.events[-1]
-            self._control.write_text(Text.NOTE, f"{self._last_event.kind.value}: {self._last_event.text}")
-            words[Word.NOTES] += 1
-
-
-def _bytes(array: NDArray[Any]) -> memoryview:
-    return array.reshape(1).view(np.uint8).data
-
-
-def _place(name: str) -> slice:
-    fields = ROW.fields
-    assert fields is not None
-    dtype, offset = fields[name][:2]
-    return slice(offset, offset + dtype.itemsize)

@@ -1,4 +1,4 @@
-"""Loops in step."""
+"""Loops with their controllers, one or several in step."""
 
 from __future__ import annotations
 
@@ -6,7 +6,21 @@ from typing import Any
 
 import pytest
 
+from tests.lwr_driver.driver_rig import Rig
 from tests.lwr_driver.driver_twins import Twins
+
+
+@pytest.fixture
+def rig():
+    rigs: list[Rig] = []
+
+    def make(period_ms: int = 1, **options: object) -> Rig:
+        rigs.append(Rig(period_ms, **options))
+        return rigs[-1]
+
+    yield make
+    for each in rigs:
+        each.close()
 
 
 @pytest.fixture

@@ -22,13 +22,14 @@ from fri.states import State
 from lwr_driver.arm import Arm, ArmLimits
 from lwr_driver.control import Control, Job, Mode, Result, Text, Word
 from lwr_driver.loop import Loop, LoopSettings
-from lwr_driver.motion import Motion
+from lwr_driver.motion import Motion, move_to
 from lwr_driver.ring import Ring
 from sim_backend.program import krl_program
 
 DEG = np.pi / 180.0
 START = np.array([0.1, 0.5, -0.2, -1.3, 0.3, 0.8, -0.1])
 POLICY = {"window": 40, "minimum_packets": 10, "start_dwell": 5}
+HOP = np.array([0.4, -0.3, 0.3, 0.5, -0.6, 0.2, 0.7])
 ROUNDING = 2.0**-23
 
 
@@ -216,6 +217,20 @@ class Rig:
 def check_sent(rig: Rig) -> None:
     """What arrived at the controller is within the arm's limits."""
     assert rig.arrived.excesses(arm().limits, rig.period_s) == []
+
+
+def hop(rig: Rig, speed_scale: float = 1.0) -> Motion:
+    return move_to(arm(), rig.target, rig.target + HOP, rig.period_s, speed_scale=speed_scale)
+
+
+def in_motion(rig: Rig, cycles: int = 60) -> Motion:
+    """A rig that has sent `cycles` rows of a motion."""
+    rig.enter()
+    motion = hop(rig)
+    rig.start(motion)
+    rig.cycles(cycles)
+    assert rig.mode is Mode.MOTION
+    return motion
 
 
 class Clock:

@@ -10,12 +10,11 @@ from lwr_driver.commander import CONTACT, RETREAT
 from lwr_driver.contact import Contact, Stale
 from lwr_driver.control import Mode, Result, Text, Word
 from lwr_driver.loop import _UNACCEPTABLE_PACKETS
-from lwr_driver.motion import Motion, move_to
+from lwr_driver.motion import move_to
 from lwr_driver.ring import Ring
-from tests.lwr_driver.driver_rig import Rig, arm, check_sent
+from tests.lwr_driver.driver_rig import HOP, Rig, arm, check_sent, in_motion
 from tests.lwr_driver.driver_twins import Watched
 
-HOP = np.array([0.4, -0.3, 0.3, 0.5, -0.6, 0.2, 0.7])
 PUSH = Contact("external torque by the model", 1, 31.0, 16.8)
 
 
@@ -49,31 +48,14 @@ class Idle:
 
 
 @pytest.fixture
-def rig():
-    rigs: list[Rig] = []
-
-    def make(period_ms: int = 5, **options: object) -> Rig:
-        rigs.append(Rig(period_ms, watch=Hand(), **options))
-        return rigs[-1]
-
-    yield make
-    for each in rigs:
-        each.close()
+def rig(rig):
+    return lambda period_ms=5, **options: rig(period_ms, watch=Hand(), **options)
 
 
 def hand(r: Rig) -> Hand:
     watch = r.loop._watch
     assert isinstance(watch, Hand)
     return watch
-
-
-def in_motion(r: Rig, cycles: int = 60) -> Motion:
-    r.enter()
-    motion = move_to(arm(), r.target, r.target + HOP, r.period_s)
-    r.start(motion)
-    r.cycles(cycles)
-    assert r.mode is Mode.MOTION
-    return motion
 
 
 def refused(r: Rig, result: Result = Result.ROBOT) -> str:

@@ -162,7 +162,7 @@ class Pair:
             ],
             "watch": [watch._last, watch._step, watch._state, watch._open],
             "control": [self.control.tracking, self.control.last_rows(64), self.control.measured],
-            "past": [setpoint for setpoint, _ in loop._past_setpoints],
+            "past": [setpoint for setpoint, _ in loop._setpoints.past],
         }
         status = self.operator.status()
         return {
