@@ -1,16 +1,15 @@
 """KRL programs on the emulated controller: the laboratory's program text itself is run.
 
-``KrlProgram`` runs the tree of `fri.krl_source` with the variables of `fri.krl_system`. ``Interpreter`` runs it
-beside an FRI session. A statement takes `statement_ms`, by default nothing; a wait ends with a tick of the
-interpolation cycle, 12 ms. Interrupts, Cartesian motions and unknown system variables have no effect, and
-``KrlProgram.remarks`` names each of them.
+``KrlProgram`` runs the statements of `fri.krl_source` one after the other, with the values of `fri.krl_values`.
+``Interpreter`` runs it beside an FRI session. A statement takes `statement_ms`, by default nothing; a wait ends with
+a tick of the interpolation cycle, 12 ms. Interrupts, Cartesian motions and unknown system variables have no effect,
+and ``KrlProgram.remarks`` names each of them.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-import operator
 from collections.abc import Callable, Generator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -21,20 +20,10 @@ from fri import krl_source
 from fri import krl_tree as tree
 from fri.errors import ConfigurationError, RobotError
 from fri.krc import KrcSession
-from fri.krl_check import Check, split
-from fri.krl_system import (
-    AXIS_NAMES,
-    HERE,
-    Machinery,
-    NoMachinery,
-    Path,
-    System,
-    duplicate,
-    first_value,
-    get,
-    positions,
-    put,
-)
+from fri.krl_check import Check
+from fri.krl_motion import PointToPoint
+from fri.krl_system import AXIS_NAMES, HERE, Machinery, NoMachinery, System, duplicate, positions
+from fri.krl_values import Frame, Values
 from fri.states import Control, State
 
 #: Interpolation cycle of the controller: a wait ends at its ticks [ms].
@@ -47,51 +36,11 @@ _LONGEST_RUN = 2000
 _DEEPEST = 100
 _SPEED_SHARE = 0.25
 _FRAME = frozenset("XYZABC")
-_SHORTEST_MOTION_MS = 50.0
-_OPERATORS: dict[str, Callable[[Any, Any], Any]] = {
-    "AND": lambda a, b: a and b,
-    "OR": lambda a, b: a or b,
-    "EXOR": operator.ne,
-    "B_AND": operator.and_,
-    "B_OR": operator.or_,
-    "B_EXOR": operator.xor,
-    "==": operator.eq,
-    "<>": operator.ne,
-    "<": operator.lt,
-    ">": operator.gt,
-    "<=": operator.le,
-    ">=": operator.ge,
-    "+": operator.add,
-    "-": operator.sub,
-    "*": operator.mul,
-}
 
 # Both yield times of the interpreter's clock [ms]; the result of `Flow` is EXIT or RETURN if one of them ended the
 # block, else empty.
 Wait = Generator[float, None, None]
 Flow = Generator[float, None, str]
-
-
-class _Motion:
-    """A synchronous motion of all axes with the least jerk, from `start` to `goal` (7,) [rad]."""
-
-    def __init__(self, session: KrcSession, goal: np.ndarray, begin_ms: float, share: float) -> None:
-        self.start, self.goal, self.begin_ms = session.krl_setpoint, goal, begin_ms
-        way, limits = np.abs(goal - self.start), session.limits
-        # Peaks of the polynomial 10 s^3 - 15 s^4 + 6 s^5.
-        fast = 1.875 * way / (limits.v_max * share)
-        hard = np.sqrt(5.774 * way / (limits.a_max * share))
-        self.duration_ms = max(_SHORTEST_MOTION_MS, 1000.0 * float(np.max(np.maximum(fast, hard))))
-        self.commanded = session.state is State.CMD
-
-    def position(self, now_ms: float) -> np.ndarray:
-        """Setpoint (7,) [rad]."""
-        s = min(1.0, max(0.0, (now_ms - self.begin_ms) / self.duration_ms))
-        return (
-            self.goal
-            if s == 1.0
-            else self.start + s**3 * (10 - 15 * s + 6 * s * s) * (self.goal - self.start)
-        )
 
 
 class _Step(NamedTuple):
@@ -105,20 +54,6 @@ class _Step(NamedTuple):
     act: Callable[[], str] | None
     choose: Callable[[], tuple[tree.Statement, ...]] | None
     statement: tree.Statement
-
-
-def _quotient(left: Any, right: Any) -> Any:
-    """KRL divides whole numbers without remainder."""
-    whole = isinstance(left, int) and isinstance(right, int)
-    return int(left / right) if whole else left / right
-
-
-class _Frame:
-    """A subprogram at work: its module and its own variables."""
-
-    def __init__(self, module: int, values: dict[str, Any]) -> None:
-        self.module, self.values = module, values
-        self.result: Any = None
 
 
 class KrlProgram:
@@ -167,25 +102,13 @@ class KrlProgram:
         self._ticks = 0
         self._nested = 0
         self._line = 0
-        # By identity: prepared blocks and expressions, statements that never wait or run no others, and places of
-        # variables without indices.
+        # By identity: prepared blocks, and whether a statement takes no time and never waits.
         self._prepared: dict[int, list[_Step]] = {}
-        self._evaluators: dict[int, Callable[[], Any]] = {}
         self._plain: dict[int, bool] = {}
-        self._single: dict[int, bool] = {}
-        self._places: dict[int, tuple[str, Path]] = {}
         self._flow: Wait | None = None
-        self._motion: _Motion | None = None
-        self._frames = [_Frame(0, {})]
-        self._globals: list[dict[str, Any]] = []
-        for number, source in enumerate(self._sources):
-            self._globals.append({})
-            self._frames[:] = [_Frame(number, {})]
-            self._globals[-1].update(self._first_values(source.declarations))
-            for element in source.elements:
-                self._write(element.target, self._value(element.value))
-        self._frames[:] = [_Frame(0, {})]
-        known = self._globals[0]
+        self._motion: PointToPoint | None = None
+        self._values = Values(self._sources, self._programs, self._system, self._nested_call)
+        known = self._values.modules[0]
         for key, value in (settings or {}).items():
             if key.upper() not in known:
                 raise ConfigurationError(f"{name}: has no variable {key}; it has {', '.join(sorted(known))}")
@@ -193,10 +116,11 @@ class KrlProgram:
 
     def preset(self, name: str, value: float | int | str) -> bool:
         """Set a variable of the data list before the start; whether the program has it."""
-        known = name in self._globals[0]
-        if known:
-            self._globals[0][name] = value
-        return known
+        known = self._values.modules[0]
+        if name not in known:
+            return False
+        known[name] = value
+        return True
 
     def step(self, session: KrcSession) -> None:
         """One tick of the interpreter: all statements up to it."""
@@ -274,23 +198,23 @@ class KrlProgram:
         try:
             yield from self._block(self._programs[title][1].body)
         finally:
-            self._frames.pop()
+            self._values.frames.pop()
             self._last = frame
 
-    def _frame(self, title: str, arguments: list[Any]) -> _Frame:
+    def _frame(self, title: str, arguments: list[Any]) -> Frame:
         """The frame of a subprogram that begins with the values of its arguments."""
         module, subprogram = self._programs[title]
-        if len(self._frames) > _DEEPEST:
+        if len(self._values.frames) > _DEEPEST:
             raise RobotError(f"{title} calls itself without end")
-        frame = _Frame(module, self._first_values(subprogram.declarations))
+        frame = Frame(module, self._values.first_values(subprogram.declarations))
         for (name, _), value in zip(subprogram.parameters, arguments, strict=False):
             frame.values[name] = duplicate(value)
-        self._frames.append(frame)
+        self._values.frames.append(frame)
         return frame
 
     def _call(self, call: tree.Call) -> Wait:
         """Run a subprogram of the program; changed arguments by reference go back to the caller."""
-        yield from self._enter(call.name, [self._value(argument) for argument in call.arguments])
+        yield from self._enter(call.name, [self._values.of(argument) for argument in call.arguments])
         self._give_back(call)
 
     def _give_back(self, call: tree.Call) -> None:
@@ -298,16 +222,16 @@ class KrlProgram:
         frame = self._last
         for (name, by_value), argument in zip(subprogram.parameters, call.arguments, strict=False):
             if not by_value and isinstance(argument, tree.Name):
-                self._write(argument, frame.values[name])
+                self._values.write(argument, frame.values[name])
         self._last = frame
 
     def _call_at_once(self, call: tree.Call) -> None:
         """As `_call`, for a subprogram that never waits."""
-        frame = self._frame(call.name, [self._value(argument) for argument in call.arguments])
+        frame = self._frame(call.name, [self._values.of(argument) for argument in call.arguments])
         try:
             self._run_at_once(self._programs[call.name][1].body)
         finally:
-            self._frames.pop()
+            self._values.frames.pop()
             self._last = frame
         self._give_back(call)
 
@@ -344,13 +268,13 @@ class KrlProgram:
         if isinstance(statement, tree.Assign) and self._is_single(statement):
             act = self._assignment(statement)
         elif isinstance(statement, tree.Branch):
-            choose = partial(self._chosen, statement, self._evaluator(statement.condition))
+            choose = partial(self._chosen, statement, self._values.evaluator(statement.condition))
         elif isinstance(statement, tree.Switch):
             choose = self._switch(statement)
         return _Step(statement.line, plain, act, choose, statement)
 
     def _assignment(self, statement: tree.Assign) -> Callable[[], str]:
-        value, write = self._evaluator(statement.value), self._writer(statement.target)
+        value, write = self._values.evaluator(statement.value), self._values.writer(statement.target)
 
         def act() -> str:
             write(value())
@@ -359,8 +283,10 @@ class KrlProgram:
         return act
 
     def _switch(self, statement: tree.Switch) -> Callable[[], tuple[tree.Statement, ...]]:
-        subject = self._evaluator(statement.subject)
-        cases = [([self._evaluator(value) for value in values], block) for values, block in statement.cases]
+        subject = self._values.evaluator(statement.subject)
+        cases = [
+            ([self._values.evaluator(value) for value in values], block) for values, block in statement.cases
+        ]
 
         def choose() -> tuple[tree.Statement, ...]:
             chosen = subject()
@@ -385,23 +311,19 @@ class KrlProgram:
 
     def _is_single(self, statement: tree.Statement) -> bool:
         """Whether the statement waits at most at its beginning, and runs no others."""
-        single = self._single.get(id(statement))
-        if single is None:
-            call = statement.value if isinstance(statement, (tree.Assign, tree.Leave)) else statement
-            own = (
-                isinstance(call, tree.Call)
-                and call.name in self._programs
-                and not isinstance(statement, tree.Leave)
-            )
-            single = isinstance(statement, (tree.Assign, tree.Leave, tree.Call)) and not own
-            self._single[id(statement)] = single
-        return single
+        single = isinstance(statement, (tree.Assign, tree.Leave, tree.Call))
+        return single and self._called(statement) is None
+
+    def _called(self, statement: tree.Statement) -> tree.Call | None:
+        """The call of a subprogram that is the whole statement, or the whole value that it assigns."""
+        call = statement.value if isinstance(statement, tree.Assign) else statement
+        return call if isinstance(call, tree.Call) and call.name in self._programs else None
 
     def _cannot_wait(self, statement: tree.Statement) -> bool:
         blocks: list[tuple[tree.Statement, ...]] = []
         if isinstance(statement, (tree.Assign, tree.Call)):
-            call = statement.value if isinstance(statement, tree.Assign) else statement
-            if isinstance(call, tree.Call) and call.name in self._programs:
+            call = self._called(statement)
+            if call is not None:
                 blocks.append(self._programs[call.name][1].body)
         elif isinstance(statement, tree.Branch):
             blocks += [statement.then, statement.otherwise]
@@ -415,63 +337,52 @@ class KrlProgram:
         """As `_block`, for statements that never wait."""
         for step in self._steps(statements):
             self._line = step.line
-            left = step.act() if step.act is not None else self._do(step.statement)
+            assert step.act is not None
+            left = step.act()
             if left:
                 return left
         return ""
 
     def _do(self, statement: tree.Statement) -> str:
-        """As `_statement`, for one that never waits."""
-        if isinstance(statement, tree.Assign):
-            value = statement.value
-            if isinstance(value, tree.Call) and value.name in self._programs:
-                self._call_at_once(value)
-                self._write(statement.target, self._last.result)
-            else:
-                self._write(statement.target, self._value(value))
-        elif isinstance(statement, tree.Branch):
-            chosen = statement.then if self._value(statement.condition) else statement.otherwise
-            return self._run_at_once(chosen)
-        elif isinstance(statement, tree.Switch):
+        """Run a statement that never waits on its way; EXIT or RETURN, else empty."""
+        if isinstance(statement, tree.Branch):
+            return self._run_at_once(
+                statement.then if self._values.of(statement.condition) else statement.otherwise
+            )
+        if isinstance(statement, tree.Switch):
             return self._run_at_once(self._switch(statement)())
-        elif isinstance(statement, tree.Leave):
+        if isinstance(statement, tree.Leave):
             if statement.value is not None:
-                self._frames[-1].result = copy.deepcopy(self._value(statement.value))
+                self._values.frames[-1].result = copy.deepcopy(self._values.of(statement.value))
             return statement.what
+        call = self._called(statement)
+        if call is not None:
+            self._call_at_once(call)
+            if isinstance(statement, tree.Assign):
+                self._values.write(statement.target, self._last.result)
+        elif isinstance(statement, tree.Assign):
+            self._values.write(statement.target, self._values.of(statement.value))
         elif isinstance(statement, tree.Call):
-            if statement.name in self._programs:
-                self._call_at_once(statement)
-            else:
-                self._value(statement)
+            self._values.of(statement)
         return ""
 
     def _statement(self, statement: tree.Statement) -> Flow:
+        """Run a statement that may wait on its way; `_do` runs the others."""
         left = ""
-        if isinstance(statement, tree.Assign):
-            value = statement.value
-            if isinstance(value, tree.Call) and value.name in self._programs:
-                yield from self._call(value)
-                self._write(statement.target, self._last.result)
-            else:
-                self._write(statement.target, self._value(value))
-        elif isinstance(statement, tree.Call):
-            if statement.name in self._programs:
-                yield from self._call(statement)
-            else:
-                self._value(statement)
-        elif isinstance(statement, tree.Leave):
-            left = statement.what
-            if statement.value is not None:
-                self._frames[-1].result = copy.deepcopy(self._value(statement.value))
+        call = self._called(statement)
+        if call is not None:
+            yield from self._call(call)
+            if isinstance(statement, tree.Assign):
+                self._values.write(statement.target, self._last.result)
         elif isinstance(statement, (tree.Loop, tree.Repeat)):
             left = yield from self._loop(statement)
         elif isinstance(statement, tree.For):
             left = yield from self._count(statement)
         elif isinstance(statement, tree.WaitFor):
-            while not self._value(statement.condition):
+            while not self._values.of(statement.condition):
                 yield from self._pause(self._tick())
         elif isinstance(statement, tree.WaitSeconds):
-            milliseconds = 1000.0 * float(self._value(statement.seconds))
+            milliseconds = 1000.0 * float(self._values.of(statement.seconds))
             if milliseconds > 0.0:
                 yield from self._pause(self._tick(milliseconds))
         elif isinstance(statement, tree.Halt):
@@ -484,29 +395,29 @@ class KrlProgram:
         return left
 
     def _count(self, statement: tree.For) -> Flow:
-        value, last = int(self._value(statement.first)), int(self._value(statement.last))
-        step = int(self._value(statement.step))
+        value, last = int(self._values.of(statement.first)), int(self._values.of(statement.last))
+        step = int(self._values.of(statement.step))
         while (value <= last) if step > 0 else (value >= last and step < 0):
-            self._write(statement.variable, value)
+            self._values.write(statement.variable, value)
             left = yield from self._block(statement.body)
             if left:
                 return "" if left == "EXIT" else left
             if (due := self._spend()) is not None:
                 yield due
             value += step
-        self._write(statement.variable, value)
+        self._values.write(statement.variable, value)
         return ""
 
     def _loop(self, statement: tree.Loop | tree.Repeat) -> Flow:
         passes, until = 0, isinstance(statement, tree.Repeat)
         while True:
-            if not until and statement.condition is not None and not self._value(statement.condition):
+            if not until and statement.condition is not None and not self._values.of(statement.condition):
                 return ""
             clock = self._clock
             left = yield from self._block(statement.body)
             if left:
                 return "" if left == "EXIT" else left
-            if until and statement.condition is not None and self._value(statement.condition):
+            if until and statement.condition is not None and self._values.of(statement.condition):
                 return ""
             if (due := self._spend()) is not None:
                 yield due
@@ -527,7 +438,7 @@ class KrlProgram:
                 soft = session.control is not Control.POSITION
                 session.resync(self.machinery.position if soft else None)
             return
-        goal = self._value(statement.goal)
+        goal = self._values.of(statement.goal)
         axes = isinstance(goal, dict) and goal.keys() & AXIS_NAMES
         # A frame may have E1 too.
         if not axes or (axes == {"E1"} and goal.keys() & _FRAME):
@@ -545,55 +456,18 @@ class KrlProgram:
             if session.state is not State.CMD:
                 session.resync()
             share = _SPEED_SHARE * max(1.0, float(self._system.read("$OV_PRO", ()))) / 100.0
-            self._motion = _Motion(session, target, self._clock, share)
+            self._motion = PointToPoint(session, target, self._clock, share)
             while self._motion is not None:
                 yield from self._pause(self._tick())
             if session.state is State.CMD or np.array_equal(session.krl_setpoint, target.astype(np.float32)):
                 return
 
-    # Values
-
     def _need(self) -> KrcSession:
         assert self._system.session is not None
         return self._system.session
 
-    def _first_values(self, declarations: Mapping[str, tree.Declaration]) -> dict[str, Any]:
-        return {
-            one.name: first_value(one.kind, one.size) if one.value is None else self._value(one.value)
-            for one in declarations.values()
-        }
-
-    def _value(self, expression: tree.Expression) -> Any:
-        evaluate = self._evaluators.get(id(expression))
-        if evaluate is None:
-            self._evaluators[id(expression)] = evaluate = self._evaluator(expression)
-        return evaluate()
-
-    def _evaluator(self, expression: tree.Expression) -> Callable[[], Any]:
-        """The value of an expression as a function, prepared once."""
-        if isinstance(expression, tree.Constant):
-            constant = expression.value
-            return lambda: constant
-        if isinstance(expression, tree.Name):
-            return self._reader(expression)
-        if isinstance(expression, tree.Binary):
-            left, right = self._evaluator(expression.left), self._evaluator(expression.right)
-            apply = _quotient if expression.operator == "/" else _OPERATORS[expression.operator]
-            return lambda: apply(left(), right())
-        if isinstance(expression, tree.Unary):
-            operand = self._evaluator(expression.operand)
-            if expression.operator == "NOT":
-                return lambda: not operand()
-            return (lambda: ~operand()) if expression.operator == "B_NOT" else (lambda: -operand())
-        if isinstance(expression, tree.Aggregate):
-            items = [(name, self._evaluator(value)) for name, value in expression.items]
-            return lambda: {name: value() for name, value in items}
-        if expression.name in self._programs:
-            return partial(self._nested_call, expression)
-        arguments = [self._evaluator(one) for one in expression.arguments]
-        return lambda: self._system.call(expression.name, [one() for one in arguments])
-
     def _nested_call(self, call: tree.Call) -> Any:
+        """The result of a subprogram that is called within an expression."""
         self._nested += 1
         try:
             for _ in self._call(call):
@@ -601,93 +475,6 @@ class KrlProgram:
         finally:
             self._nested -= 1
         return self._last.result
-
-    def _reader(self, name: tree.Name) -> Callable[[], Any]:
-        """The value of a variable as a function; without indices to be worked out its place is found once."""
-        fixed = self._fixed_place(name)
-        if fixed is None:
-            return partial(self._read, name)
-        title, path = fixed
-        frames, modules, outside = self._frames, self._globals, self._system.reader(title, path)
-
-        def read() -> Any:
-            frame = frames[-1]
-            owner = frame.values
-            if title not in owner:
-                owner = modules[frame.module]
-                if title not in owner:
-                    return outside()
-            return get(owner[title], path, title) if path else owner[title]
-
-        return read
-
-    def _writer(self, name: tree.Name) -> Callable[[Any], None]:
-        """As `_reader`, to set a variable."""
-        fixed = self._fixed_place(name)
-        if fixed is None:
-            return partial(self._write, name)
-        title, path = fixed
-        frames, modules, outside = self._frames, self._globals, self._system.writer(title, path)
-
-        def write(value: Any) -> None:
-            frame = frames[-1]
-            owner = frame.values
-            if title not in owner:
-                owner = modules[frame.module]
-                if title not in owner:
-                    outside(value)
-                    return
-            owner[title] = put(owner[title], path, value, title)
-
-        return write
-
-    def _fixed_place(self, name: tree.Name) -> tuple[str, Path] | None:
-        """Name and path of a variable with constant indices only, else None."""
-        steps = ((name.index,) if name.index is not None else ()) + name.rest
-        if all(isinstance(step, (str, tree.Constant)) for step in steps):
-            title, path, _ = self._place(name)
-            return title, path
-        return None
-
-    def _place(self, name: tree.Name) -> tuple[str, Path, dict[str, Any] | None]:
-        """Name, path, and owner of a variable; None for the controller."""
-        known = self._places.get(id(name))
-        if known is not None:
-            title, fixed = known
-            return title, fixed, self._owner(title)
-        title, fields = split(name.name)
-        path: list[str | int | tuple[int, ...]] = list(fields)
-        indices: list[int] = []
-        for step in ((name.index,) if name.index is not None else ()) + name.rest:
-            if isinstance(step, str):
-                path += [tuple(indices) if len(indices) > 1 else indices[0]] if indices else []
-                path.append(step[1:])
-                indices = []
-            else:
-                indices.append(int(self._value(step)))
-        path += [tuple(indices) if len(indices) > 1 else indices[0]] if indices else []
-        steps = ((name.index,) if name.index is not None else ()) + name.rest
-        if all(isinstance(step, (str, tree.Constant)) for step in steps):
-            self._places[id(name)] = title, tuple(path)
-        return title, tuple(path), self._owner(title)
-
-    def _owner(self, title: str) -> dict[str, Any] | None:
-        frame = self._frames[-1]
-        if title in frame.values:
-            return frame.values
-        known = self._globals[frame.module]
-        return known if title in known else None
-
-    def _read(self, name: tree.Name) -> Any:
-        title, path, owner = self._place(name)
-        return self._system.read(title, path) if owner is None else get(owner[title], path, title)
-
-    def _write(self, name: tree.Name, value: Any) -> None:
-        title, path, owner = self._place(name)
-        if owner is None:
-            self._system.write(title, path, value)
-        else:
-            owner[title] = put(owner[title], path, value, title)
 
 
 class Interpreter:
