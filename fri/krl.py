@@ -360,8 +360,6 @@ class KrlProgram:
             self._call_at_once(call)
             if isinstance(statement, tree.Assign):
                 self._values.write(statement.target, self._last.result)
-        elif isinstance(statement, tree.Assign):
-            self._values.write(statement.target, self._values.of(statement.value))
         elif isinstance(statement, tree.Call):
             self._values.of(statement)
         return ""

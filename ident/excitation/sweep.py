@@ -135,6 +135,122 @@ def forward(arm, motion, columns, chi, eps, z, tau):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, error_model="numpy")
+def _adjoint_of_columns(i, columns, chi, zbar, taubar, vectors, y, adjoints):  # type: ignore[no-untyped-def]
+    """Fill the derivatives wb, db, vb (n, 3), lb, ab (b, j, 3) with respect to the vectors of sample `i`."""
+    first, parameter = columns
+    w, wd, vd, lin, ang = vectors
+    wb, db, vb, lb, ab = adjoints
+    sets, n = chi.shape[0], chi.shape[1]
+    for b in range(n):
+        wx, wy, wz = w[b, 0], w[b, 1], w[b, 2]
+        dx, dy, dz = wd[b, 0], wd[b, 1], wd[b, 2]
+        vx, vy, vz = vd[b, 0], vd[b, 1], vd[b, 2]
+        ww = wx * wx + wy * wy + wz * wz
+        wbx = wby = wbz = 0.0
+        dbx = dby = dbz = 0.0
+        vbx = vby = vbz = 0.0
+        for j in range(b + 1):
+            for p in range(10):
+                value = 0.0
+                for s in range(sets):
+                    value += taubar[s, i, j] * chi[s, b, p]
+                y[p] = value
+            for k in range(first[b], first[b + 1]):
+                y[parameter[k]] += zbar[j, i, k]
+            ax, ay, az = ang[b, j, 0], ang[b, j, 1], ang[b, j, 2]
+            lx, ly, lz = lin[b, j, 0], lin[b, j, 1], lin[b, j, 2]
+            ex = ay * wz - az * wy
+            ey = az * wx - ax * wz
+            ez = ax * wy - ay * wx
+            # the adjoint of the inertia columns is a symmetric matrix S: S wd, S w, S a + ..., S e
+            ebx = y[0] * wx + y[1] * wy + y[2] * wz
+            eby = y[1] * wx + y[3] * wy + y[4] * wz
+            ebz = y[2] * wx + y[4] * wy + y[5] * wz
+            abx = y[0] * dx + y[1] * dy + y[2] * dz + wy * ebz - wz * eby
+            aby = y[1] * dx + y[3] * dy + y[4] * dz + wz * ebx - wx * ebz
+            abz = y[2] * dx + y[4] * dy + y[5] * dz + wx * eby - wy * ebx
+            mx, my, mz, mass = y[6], y[7], y[8], y[9]
+            wm = wx * mx + wy * my + wz * mz
+            lm = lx * mx + ly * my + lz * mz
+            lw = lx * wx + ly * wy + lz * wz
+            wbx += y[0] * ex + y[1] * ey + y[2] * ez + eby * az - ebz * ay
+            wby += y[1] * ex + y[3] * ey + y[4] * ez + ebz * ax - ebx * az
+            wbz += y[2] * ex + y[4] * ey + y[5] * ez + ebx * ay - eby * ax
+            wbx += wm * lx + lw * mx - 2.0 * lm * wx
+            wby += wm * ly + lw * my - 2.0 * lm * wy
+            wbz += wm * lz + lw * mz - 2.0 * lm * wz
+            dbx += y[0] * ax + y[1] * ay + y[2] * az + my * lz - mz * ly
+            dby += y[1] * ax + y[3] * ay + y[4] * az + mz * lx - mx * lz
+            dbz += y[2] * ax + y[4] * ay + y[5] * az + mx * ly - my * lx
+            vbx += ay * mz - az * my + mass * lx
+            vby += az * mx - ax * mz + mass * ly
+            vbz += ax * my - ay * mx + mass * lz
+            lb[b, j, 0] = dy * mz - dz * my + wm * wx - ww * mx + mass * vx
+            lb[b, j, 1] = dz * mx - dx * mz + wm * wy - ww * my + mass * vy
+            lb[b, j, 2] = dx * my - dy * mx + wm * wz - ww * mz + mass * vz
+            ab[b, j, 0] = abx + my * vz - mz * vy
+            ab[b, j, 1] = aby + mz * vx - mx * vz
+            ab[b, j, 2] = abz + mx * vy - my * vx
+        wb[b, 0], wb[b, 1], wb[b, 2] = wbx, wby, wbz
+        db[b, 0], db[b, 1], db[b, 2] = dbx, dby, dbz
+        vb[b, 0], vb[b, 1], vb[b, 2] = vbx, vby, vbz
+
+
+@njit(cache=True, error_model="numpy")
+def _adjoint_of_kinematics(rot0, trans, qd, cs, vectors, adjoints, qbar, qdbar, qddbar):  # type: ignore[no-untyped-def]
+    """Run `_kinematics` backwards: from the derivatives of its vectors to those of q, qd, qdd (n,), added."""
+    w, wd, vd, lin, ang = vectors
+    wb, db, vb, lb, ab = adjoints
+    n = qd.shape[0]
+    for b in range(n - 1, -1, -1):
+        cb, sb = cs[b, 0], cs[b, 1]
+        r = rot0[b]
+        px, py, pz = trans[b, 0], trans[b, 1], trans[b, 2]
+        rate = qd[b]
+        tx, ty = w[b, 0], w[b, 1]
+        dbx, dby, dbz = db[b, 0], db[b, 1], db[b, 2]
+        wbx = wb[b, 0] - dby * rate
+        wby = wb[b, 1] + dbx * rate
+        wbz = wb[b, 2]
+        vbx, vby, vbz = vb[b, 0], vb[b, 1], vb[b, 2]
+        qddbar[b] += dbz
+        qdbar[b] += wbz + dbx * ty - dby * tx
+        angle = wbx * ty - wby * tx
+        angle += dbx * (wd[b, 1] + tx * rate) - dby * (wd[b, 0] - ty * rate)
+        angle += vbx * vd[b, 1] - vby * vd[b, 0]
+        if b > 0:
+            gx, gy, gz = _out(r, cb, sb, vbx, vby, vbz)
+            vb[b - 1, 0] += gx
+            vb[b - 1, 1] += gy
+            vb[b - 1, 2] += gz
+            ux, uy, uz = _out(r, cb, sb, dbx, dby, dbz)
+            db[b - 1, 0] += ux + py * gz - pz * gy
+            db[b - 1, 1] += uy + pz * gx - px * gz
+            db[b - 1, 2] += uz + px * gy - py * gx
+            wx, wy, wz = w[b - 1, 0], w[b - 1, 1], w[b - 1, 2]
+            gw = gx * wx + gy * wy + gz * wz
+            wp = wx * px + wy * py + wz * pz
+            gp = gx * px + gy * py + gz * pz
+            ux, uy, uz = _out(r, cb, sb, wbx, wby, wbz)
+            wb[b - 1, 0] += ux + gw * px + wp * gx - 2.0 * gp * wx
+            wb[b - 1, 1] += uy + gw * py + wp * gy - 2.0 * gp * wy
+            wb[b - 1, 2] += uz + gw * pz + wp * gz - 2.0 * gp * wz
+            for j in range(b):
+                ax, ay, az = ab[b, j, 0], ab[b, j, 1], ab[b, j, 2]
+                lx, ly, lz = lb[b, j, 0], lb[b, j, 1], lb[b, j, 2]
+                angle += ax * ang[b, j, 1] - ay * ang[b, j, 0] + lx * lin[b, j, 1] - ly * lin[b, j, 0]
+                gx, gy, gz = _out(r, cb, sb, lx, ly, lz)
+                lb[b - 1, j, 0] += gx
+                lb[b - 1, j, 1] += gy
+                lb[b - 1, j, 2] += gz
+                ux, uy, uz = _out(r, cb, sb, ax, ay, az)
+                ab[b - 1, j, 0] += ux + py * gz - pz * gy
+                ab[b - 1, j, 1] += uy + pz * gx - px * gz
+                ab[b - 1, j, 2] += uz + px * gy - py * gx
+        qbar[b] += angle
+
+
+@njit(cache=True, error_model="numpy")
 def backward(arm, motion, columns, chi, eps, zbar, taubar, bars):  # type: ignore[no-untyped-def]
     """Add the derivative of a function of `forward`'s results with respect to q, qd, qdd to `bars`, (m, n) each.
 
@@ -142,16 +258,15 @@ def backward(arm, motion, columns, chi, eps, zbar, taubar, bars):  # type: ignor
     """
     rot0, trans, gravity = arm
     q, qd, qdd = motion
-    first, parameter = columns
     qbar, qdbar, qddbar = bars
     m, n = q.shape
-    sets = chi.shape[0]
-    c = parameter.shape[0]
+    c = columns[1].shape[0]
     cs = np.empty((n, 2))
     w, wd, vd = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
     lin, ang = np.empty((n, n, 3)), np.empty((n, n, 3))
     wb, db, vb = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
     lb, ab = np.empty((n, n, 3)), np.empty((n, n, 3))
+    vectors, adjoints = (w, wd, vd, lin, ang), (wb, db, vb, lb, ab)
     y = np.empty(10)
     for i in range(m):
         _kinematics(rot0, trans, gravity, q[i], qd[i], qdd[i], cs, w, wd, vd, lin, ang)
@@ -159,102 +274,5 @@ def backward(arm, motion, columns, chi, eps, zbar, taubar, bars):  # type: ignor
             sign = np.tanh(qd[i, j] / eps)
             qddbar[i, j] += zbar[j, i, c]
             qdbar[i, j] += zbar[j, i, c + 1] + zbar[j, i, c + 2] * (1.0 - sign * sign) / eps
-        for b in range(n):
-            wx, wy, wz = w[b, 0], w[b, 1], w[b, 2]
-            dx, dy, dz = wd[b, 0], wd[b, 1], wd[b, 2]
-            vx, vy, vz = vd[b, 0], vd[b, 1], vd[b, 2]
-            ww = wx * wx + wy * wy + wz * wz
-            wbx = wby = wbz = 0.0
-            dbx = dby = dbz = 0.0
-            vbx = vby = vbz = 0.0
-            for j in range(b + 1):
-                for p in range(10):
-                    value = 0.0
-                    for s in range(sets):
-                        value += taubar[s, i, j] * chi[s, b, p]
-                    y[p] = value
-                for k in range(first[b], first[b + 1]):
-                    y[parameter[k]] += zbar[j, i, k]
-                ax, ay, az = ang[b, j, 0], ang[b, j, 1], ang[b, j, 2]
-                lx, ly, lz = lin[b, j, 0], lin[b, j, 1], lin[b, j, 2]
-                ex = ay * wz - az * wy
-                ey = az * wx - ax * wz
-                ez = ax * wy - ay * wx
-                # the adjoint of the inertia columns is a symmetric matrix S: S wd, S w, S a + ..., S e
-                ebx = y[0] * wx + y[1] * wy + y[2] * wz
-                eby = y[1] * wx + y[3] * wy + y[4] * wz
-                ebz = y[2] * wx + y[4] * wy + y[5] * wz
-                abx = y[0] * dx + y[1] * dy + y[2] * dz + wy * ebz - wz * eby
-                aby = y[1] * dx + y[3] * dy + y[4] * dz + wz * ebx - wx * ebz
-                abz = y[2] * dx + y[4] * dy + y[5] * dz + wx * eby - wy * ebx
-                mx, my, mz, mass = y[6], y[7], y[8], y[9]
-                wm = wx * mx + wy * my + wz * mz
-                lm = lx * mx + ly * my + lz * mz
-                lw = lx * wx + ly * wy + lz * wz
-                wbx += y[0] * ex + y[1] * ey + y[2] * ez + eby * az - ebz * ay
-                wby += y[1] * ex + y[3] * ey + y[4] * ez + ebz * ax - ebx * az
-                wbz += y[2] * ex + y[4] * ey + y[5] * ez + ebx * ay - eby * ax
-                wbx += wm * lx + lw * mx - 2.0 * lm * wx
-                wby += wm * ly + lw * my - 2.0 * lm * wy
-                wbz += wm * lz + lw * mz - 2.0 * lm * wz
-                dbx += y[0] * ax + y[1] * ay + y[2] * az + my * lz - mz * ly
-                dby += y[1] * ax + y[3] * ay + y[4] * az + mz * lx - mx * lz
-                dbz += y[2] * ax + y[4] * ay + y[5] * az + mx * ly - my * lx
-                vbx += ay * mz - az * my + mass * lx
-                vby += az * mx - ax * mz + mass * ly
-                vbz += ax * my - ay * mx + mass * lz
-                lb[b, j, 0] = dy * mz - dz * my + wm * wx - ww * mx + mass * vx
-                lb[b, j, 1] = dz * mx - dx * mz + wm * wy - ww * my + mass * vy
-                lb[b, j, 2] = dx * my - dy * mx + wm * wz - ww * mz + mass * vz
-                ab[b, j, 0] = abx + my * vz - mz * vy
-                ab[b, j, 1] = aby + mz * vx - mx * vz
-                ab[b, j, 2] = abz + mx * vy - my * vx
-            wb[b, 0], wb[b, 1], wb[b, 2] = wbx, wby, wbz
-            db[b, 0], db[b, 1], db[b, 2] = dbx, dby, dbz
-            vb[b, 0], vb[b, 1], vb[b, 2] = vbx, vby, vbz
-        for b in range(n - 1, -1, -1):
-            cb, sb = cs[b, 0], cs[b, 1]
-            r = rot0[b]
-            px, py, pz = trans[b, 0], trans[b, 1], trans[b, 2]
-            rate = qd[i, b]
-            tx, ty = w[b, 0], w[b, 1]
-            dbx, dby, dbz = db[b, 0], db[b, 1], db[b, 2]
-            wbx = wb[b, 0] - dby * rate
-            wby = wb[b, 1] + dbx * rate
-            wbz = wb[b, 2]
-            vbx, vby, vbz = vb[b, 0], vb[b, 1], vb[b, 2]
-            qddbar[i, b] += dbz
-            qdbar[i, b] += wbz + dbx * ty - dby * tx
-            angle = wbx * ty - wby * tx
-            angle += dbx * (wd[b, 1] + tx * rate) - dby * (wd[b, 0] - ty * rate)
-            angle += vbx * vd[b, 1] - vby * vd[b, 0]
-            if b > 0:
-                gx, gy, gz = _out(r, cb, sb, vbx, vby, vbz)
-                vb[b - 1, 0] += gx
-                vb[b - 1, 1] += gy
-                vb[b - 1, 2] += gz
-                ux, uy, uz = _out(r, cb, sb, dbx, dby, dbz)
-                db[b - 1, 0] += ux + py * gz - pz * gy
-                db[b - 1, 1] += uy + pz * gx - px * gz
-                db[b - 1, 2] += uz + px * gy - py * gx
-                wx, wy, wz = w[b - 1, 0], w[b - 1, 1], w[b - 1, 2]
-                gw = gx * wx + gy * wy + gz * wz
-                wp = wx * px + wy * py + wz * pz
-                gp = gx * px + gy * py + gz * pz
-                ux, uy, uz = _out(r, cb, sb, wbx, wby, wbz)
-                wb[b - 1, 0] += ux + gw * px + wp * gx - 2.0 * gp * wx
-                wb[b - 1, 1] += uy + gw * py + wp * gy - 2.0 * gp * wy
-                wb[b - 1, 2] += uz + gw * pz + wp * gz - 2.0 * gp * wz
-                for j in range(b):
-                    ax, ay, az = ab[b, j, 0], ab[b, j, 1], ab[b, j, 2]
-                    lx, ly, lz = lb[b, j, 0], lb[b, j, 1], lb[b, j, 2]
-                    angle += ax * ang[b, j, 1] - ay * ang[b, j, 0] + lx * lin[b, j, 1] - ly * lin[b, j, 0]
-                    gx, gy, gz = _out(r, cb, sb, lx, ly, lz)
-                    lb[b - 1, j, 0] += gx
-                    lb[b - 1, j, 1] += gy
-                    lb[b - 1, j, 2] += gz
-                    ux, uy, uz = _out(r, cb, sb, ax, ay, az)
-                    ab[b - 1, j, 0] += ux + py * gz - pz * gy
-                    ab[b - 1, j, 1] += uy + pz * gx - px * gz
-                    ab[b - 1, j, 2] += uz + px * gy - py * gx
-            qbar[i, b] += angle
+        _adjoint_of_columns(i, columns, chi, zbar, taubar, vectors, y, adjoints)
+        _adjoint_of_kinematics(rot0, trans, qd[i], cs, vectors, adjoints, qbar[i], qdbar[i], qddbar[i])

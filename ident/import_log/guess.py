@@ -121,43 +121,23 @@ class _Guesser:
         self.reasons: dict[str, str] = {}
 
     def guess(self) -> Guess:
-        position = self._best("position")
-        if position is None:
-            raise self._unknown("position")
-        joints, why = self._joints(position)
-        if (
-            self.known.joints
-            and position.values.shape[1] > len(joints)
-            and not set(joints) <= set(position.labels)
-        ):
-            self._name_columns(position.values.shape[1])
-            position = self._best("position") or position
-        whole, position = position, self._picked(position, joints)
-        bad = np.flatnonzero(~np.isfinite(position.values).all(axis=1))
-        if len(bad):
-            raise DataError(
-                f"{self.source}: {position.shown} has missing values in {in_rows(len(bad))} of {len(position.values)}, "
-                f"first in row {bad[0]}; at most {100.0 * MOST_MISSING:g} % may be: take other columns, or import "
-                "a part with `lwr-run import --rows`, each with a mapping file"
-            )
+        whole, joints, why = self._positions()
+        position = self._picked(whole, joints)
+        self._require_finite(position)
         unit, reason = self._angle_unit(position, joints, self._best("velocity", joints))
-        size = ANGLES[unit]
         gripper = False
         if not self.known.joints and self.known.tip is None:
-            arm = without_gripper(joints, position.values * size, self.robot, self.known.base)
+            arm = without_gripper(joints, position.values * ANGLES[unit], self.robot, self.known.base)
             if gripper := len(arm) < len(joints):
                 if not set(joints) <= set(position.labels):
                     self._name_columns(len(joints))
                 whole = replace(position, labels=joints)
                 joints, why = arm, f"{why}, without the gripper at rest"
                 position = self._picked(self._best("position", joints) or whole, joints)
-        held = (
-            self._rests(whole, joints, unit)
-            if (self.known.joints or gripper) and position is not whole
-            else {}
-        )
-        angle, _ = unwrapped(position.values * size)
+        others = (self.known.joints or gripper) and position is not whole
+        held = self._rests(whole, joints, unit) if others else {}
         velocity = self._finite(self._best("velocity", joints))
+        angle, _ = unwrapped(position.values * ANGLES[unit])
         clock = self.clocks.of(angle, velocity, unit)
         self.rows.append(("time", clock.field.shown if clock.field else "", clock.unit, clock.why))
         if clock.field:
@@ -167,16 +147,7 @@ class _Guesser:
             self._one_unit(position, velocity, joints, rates, unit)
         signals: dict[str, Any] = {"position": self._take("position", position, unit, reason)}
         if velocity is not None and rates is not None and velocity.name not in self.reasons:
-            if (found := rate_unit(rates)) is not None:
-                name, factor = found
-                why_rate = f"{factor:.2f} times dq/dt in this unit"
-                if same_in_all(rates, factor):
-                    why_rate += ", in all joints: a clock or a scale is off"
-                signals["velocity"] = self._take("velocity", velocity, name, why_rate)
-            else:
-                unlike = rates.unlike.tolist() if len(rates.unlike) < len(joints) else []
-                which = f", at {', '.join(joints[k] for k in unlike)}" if unlike else ""
-                self.reasons[velocity.name] = f"not dq/dt of the positions in any unit{which}"
+            signals |= self._velocity(velocity, rates, joints)
         signals |= self._torques(joints)
         self.rows.append(("joints", _span(joints), "", why))
         gear = any(signal.before_gear for signal in signals.values())
@@ -193,12 +164,49 @@ class _Guesser:
         )
         order = ("time", "position", "velocity", "joint_torque", "motor_torque", "joints", "held")
         self.rows.sort(key=lambda row: order.index(row[0]))
-        unused = tuple(
+        return Guess(self.source, mapping, tuple(self.rows), self._unused())
+
+    def _positions(self) -> tuple[Field, tuple[str, ...], str]:
+        """The positions of all recorded joints, the joints of the model, and why it is these."""
+        position = self._best("position")
+        if position is None:
+            raise self._unknown("position")
+        joints, why = self._joints(position)
+        count = position.values.shape[1]
+        if self.known.joints and count > len(joints) and not set(joints) <= set(position.labels):
+            self._name_columns(count)
+            position = self._best("position") or position
+        return position, joints, why
+
+    def _require_finite(self, position: Field) -> None:
+        bad = np.flatnonzero(~np.isfinite(position.values).all(axis=1))
+        if len(bad):
+            raise DataError(
+                f"{self.source}: {position.shown} has missing values in {in_rows(len(bad))} of {len(position.values)}, "
+                f"first in row {bad[0]}; at most {100.0 * MOST_MISSING:g} % may be: take other columns, or import "
+                "a part with `lwr-run import --rows`, each with a mapping file"
+            )
+
+    def _velocity(self, velocity: Field, rates: Rates, joints: Sequence[str]) -> dict[str, Signal]:
+        """The signal of the velocity, empty with the reason noted where it is no dq/dt."""
+        found = rate_unit(rates)
+        if found is None:
+            odd = rates.unlike.tolist() if len(rates.unlike) < len(joints) else []
+            which = f", at {', '.join(joints[k] for k in odd)}" if odd else ""
+            self.reasons[velocity.name] = f"not dq/dt of the positions in any unit{which}"
+            return {}
+        unit, factor = found
+        why = f"{factor:.2f} times dq/dt in this unit"
+        if same_in_all(rates, factor):
+            why += ", in all joints: a clock or a scale is off"
+        return {"velocity": self._take("velocity", velocity, unit, why)}
+
+    def _unused(self) -> tuple[str, ...]:
+        return tuple(
             f"{one.shown} ({self.reasons[one.name]})" if one.name in self.reasons else one.shown
             for one in self.fields
             if one.name not in self.used
         )
-        return Guess(self.source, mapping, tuple(self.rows), unused)
 
     def _picked(self, position: Field, joints: Sequence[str]) -> Field:
         """The columns of these joints."""

@@ -35,55 +35,17 @@ def check_speeds(session: Session) -> Iterator[Doubt]:
         return
     inner, slope, change = blocks
     yield from _late(session, inner, slope, change)
-    moved = np.ptp(joint.position, axis=0) > MOVED
+    moved = np.flatnonzero(np.ptp(joint.position, axis=0) > MOVED).tolist()
     factors: dict[int, float] = {}
-    for k in map(int, np.flatnonzero(moved)):
+    for k in moved:
         speed, own = slope[:, k], inner[:, k]
-        if not own.any():
-            seen, mend = (
-                "reads 0 while the joint moves",
-                "repair the column, or import the log without velocities",
-            )
-            yield Doubt("velocity", (session.joint_names[k],), seen, "a dead channel", mend, False, name)
-            continue
-        related = _correlation(speed, own)
-        if abs(related) < _CORRELATED:
-            others = [
-                j
-                for j in map(int, np.flatnonzero(moved))
-                if j != k and abs(_correlation(slope[:, j], own)) > 0.95
-            ]
-            looks = (
-                f"the velocity of {session.joint_names[others[0]]}"
-                if others
-                else "another joint or another time"
-            )
-            seen = f"follows dq/dt of the position with a correlation of {related:.2f}"
-            mend = "check the columns of position and velocity of this joint"
-            if others or abs(related) < 0.5:
-                yield Doubt("velocity", (session.joint_names[k],), seen, looks, mend, bool(others), name)
-            continue
-        factors[k] = float(own @ speed / (speed @ speed))
+        if own.any() and abs(_correlation(speed, own)) >= _CORRELATED:
+            factors[k] = float(own @ speed / (speed @ speed))
+        else:
+            yield from _of_another(session, k, moved, inner, slope)
     wrong = {k: f for k, f in factors.items() if abs(f - 1.0) > _SPEEDS}
-    common = float(np.median(list(factors.values()))) if factors else 1.0
-    spread = max((abs(f / common - 1.0) for f in factors.values()), default=0.0)
-    beside = abs(common - 1.0)
-    shared = len(wrong) == len(factors) and spread < _SPEEDS
-    if len(factors) > 1 and (shared or (beside > _COMMON and spread < _SPREAD * beside)):
-        seen = f"the velocities of all joints are {common:.4g} times dq/dt"
-        known = [unit for value, unit in _SPEED_UNITS.items() if abs(common / value - 1.0) < _SPEEDS]
-        if known:
-            mend = "state the factor of the velocities when importing; the fit does not use them"
-            yield Doubt(
-                "velocity", tuple(session.joint_names[k] for k in wrong), seen, known[0], mend, False, name
-            )
-            return
-        looks = f"stamps that pass {common:.4g} times too fast, or velocities in another unit"
-        mend = "state the unit of time, or the factor of the velocities, when importing"
-        if not shared:
-            looks = f"stamps that pass {common:.4g} times too fast, or a wrong scale of the velocities"
-            mend = "check the rate of the recording; inertia is wrong by the square of the rate's error"
-        yield Doubt("time", (), seen, looks, mend, _by_unit(common), name)
+    if (doubt := _common_factor(session, factors, wrong)) is not None:
+        yield doubt
         return
     for k, factor in wrong.items():
         seen = f"is {factor:.4g} times dq/dt of the position"
@@ -91,6 +53,49 @@ def check_speeds(session: Session) -> Iterator[Doubt]:
         looks = f"a {kind} of one of the two"
         mend = "check sign and unit of position and velocity of this joint"
         yield Doubt("velocity", (session.joint_names[k],), seen, looks, mend, False, name)
+
+
+def _of_another(session: Session, k: int, moved: list[int], inner: Floats, slope: Floats) -> Iterator[Doubt]:
+    """The velocity of joint `k`, unlike dq/dt: dead, or that of another of the joints that `moved`."""
+    names, name = session.joint_names, session.path.name
+    if not inner[:, k].any():
+        mend = "repair the column, or import the log without velocities"
+        seen = "reads 0 while the joint moves"
+        yield Doubt("velocity", (names[k],), seen, "a dead channel", mend, False, name)
+        return
+    related = _correlation(slope[:, k], inner[:, k])
+    others = [j for j in moved if j != k and abs(_correlation(slope[:, j], inner[:, k])) > 0.95]
+    if others or abs(related) < 0.5:
+        looks = f"the velocity of {names[others[0]]}" if others else "another joint or another time"
+        seen = f"follows dq/dt of the position with a correlation of {related:.2f}"
+        mend = "check the columns of position and velocity of this joint"
+        yield Doubt("velocity", (names[k],), seen, looks, mend, bool(others), name)
+
+
+def _common_factor(session: Session, factors: dict[int, float], wrong: dict[int, float]) -> Doubt | None:
+    """One factor of velocity over dq/dt in all joints: another unit, or another pace of the stamps.
+
+    factors : by joint. wrong : those beyond filters and jitter.
+    """
+    name = session.path.name
+    common = float(np.median(list(factors.values()))) if factors else 1.0
+    spread = max((abs(f / common - 1.0) for f in factors.values()), default=0.0)
+    beside = abs(common - 1.0)
+    shared = len(wrong) == len(factors) and spread < _SPEEDS
+    if len(factors) < 2 or not (shared or (beside > _COMMON and spread < _SPREAD * beside)):
+        return None
+    seen = f"the velocities of all joints are {common:.4g} times dq/dt"
+    known = [unit for value, unit in _SPEED_UNITS.items() if abs(common / value - 1.0) < _SPEEDS]
+    if known:
+        joints = tuple(session.joint_names[k] for k in wrong)
+        mend = "state the factor of the velocities when importing; the fit does not use them"
+        return Doubt("velocity", joints, seen, known[0], mend, False, name)
+    looks = f"stamps that pass {common:.4g} times too fast, or velocities in another unit"
+    mend = "state the unit of time, or the factor of the velocities, when importing"
+    if not shared:
+        looks = f"stamps that pass {common:.4g} times too fast, or a wrong scale of the velocities"
+        mend = "check the rate of the recording; inertia is wrong by the square of the rate's error"
+    return Doubt("time", (), seen, looks, mend, _by_unit(common), name)
 
 
 def _speeds(joint: JointColumns) -> tuple[Floats, Floats, Floats] | None:
