@@ -11,6 +11,7 @@ from ident.diagnosis.healthy.reference import Reference
 from ident.dynamics.structure import EncoderSide
 from ident.model import DynamicModel
 from ident.model.model_file import read_model
+from ident.model.signals import positions_of_motors
 from lwr_driver.configuration import find
 from lwr_driver.references import Frozen
 from lwr_driver.session import Session
@@ -22,8 +23,8 @@ from sim_backend.configuration import load_configuration
 def encoder_of(session: Session, folder: Path, models: Iterable[DynamicModel]) -> EncoderSide | None:
     """Where the arm of a session has its encoders; None if nothing tells.
 
-    Told by the settings of the emulated arm, else by its healthy baseline (`lwr-run commission`), else by an effect
-    found in `models` with the place as its form. folder : of the session's results.
+    Told by the settings of the emulated arm, else by its healthy baseline (`lwr-run commission`) or by the signals of
+    one of `models`, else by an effect found in them with the place as its form. folder : of the session's results.
     """
     models = list(models)
     experiment = _experiment(session, folder)
@@ -39,6 +40,8 @@ def encoder_of(session: Session, folder: Path, models: Iterable[DynamicModel]) -
         baseline = Reference.of(model)
         if baseline.sets:
             return baseline.encoder
+        if positions_of_motors(model):
+            return "motor"
     for entry in (entry for model in models for entry in model.effects):
         place: dict[str, EncoderSide] = {"encoder at the motor": "motor", "encoder at the link": "link"}
         if entry.get("form") in place:

@@ -31,6 +31,7 @@ from fri.errors import ConfigurationError, DataError
 from ident.diagnosis import SimulationError
 from ident.dynamics.structure import EncoderSide
 from ident.model import DynamicModel
+from ident.model.signals import positions_of_motors
 from ident.rows.filters import low_pass, median_step
 from ident.rows.sessions import payload_name
 from lwr_driver.configuration import parse
@@ -98,7 +99,8 @@ class Replay:
 
     stiffness : (n,) of the joints [Nm/rad], as of `replay`. sessions : all of the diagnosis, for their numbers.
     longest_s : longest simulated part of a session, extended for an effect at a later moment. encoder : side of the
-    elastic joints with the published positions. first : by call, the first replayed session and its replay.
+    elastic joints with the published positions, None: as the model takes them. first : by call, the first replayed
+    session and its replay.
     """
 
     def __init__(
@@ -107,7 +109,7 @@ class Replay:
         sessions: Sequence[Session] = (),
         *,
         longest_s: float = 60.0,
-        encoder: EncoderSide = "link",
+        encoder: EncoderSide | None = None,
     ) -> None:
         self.stiffness = stiffness
         self.longest_s = longest_s
@@ -134,7 +136,7 @@ class Replay:
                     session,
                     self.longest_s,
                     stiffness=self.stiffness,
-                    encoder=self.encoder,
+                    encoder=self.encoder or ("motor" if positions_of_motors(model) else "link"),
                     number=number,
                     inertia=self._inertia.get(session.start),
                 )

@@ -78,7 +78,7 @@ def diagnose(
     ready = preparation(sessions, test, chain, settings, couplings, reference)
     settings, recordings, broken = ready.settings, ready.recordings, ready.broken
     with blamed(broken, chain.joint_names):
-        nominal = nominal_arm(chain, arm, reference)
+        nominal = nominal_arm(chain, arm, reference, settings.signals)
         task = Task(
             sessions, test, nominal, recordings, settings, reference, causes, model, simulate, not broken
         )

@@ -38,6 +38,12 @@ def signals_entry(settings: SignalSettings, prepared: Sequence[PreparedSession] 
     return entry
 
 
+def positions_of_motors(model: DynamicModel) -> bool:
+    """Whether a model takes the positions for those of the motors."""
+    settings = signal_settings(model)
+    return settings is not None and settings.takes_links_back
+
+
 def signal_settings(model: DynamicModel) -> SignalSettings | None:
     """The signal settings of a model, its delays included; None for a model without.
 

@@ -180,6 +180,11 @@ class SignalSettings:
         )
 
     @property
+    def takes_links_back(self) -> bool:
+        """Whether rows have the links' motion, taken back from positions of the motors by the stiffness."""
+        return self.encoder == "motor" and self.stiffness_nm_rad is not None
+
+    @property
     def punctual(self) -> SignalSettings:
         """The same with no channel late."""
         return replace(self, motor_delay_s=0.0, joint_delay_s=0.0)

@@ -151,7 +151,7 @@ def study(
     everything = sorted([*sessions, *test], key=lambda s: s.start)
     replay = None
     if simulate:
-        encoder = "link" if healthy is None else healthy.encoder
+        encoder = healthy.encoder if healthy is not None and healthy.sets else None
         replay = Replay(_stiffness(arm, healthy), everything, encoder=encoder)
     logs, held_out = list(sessions), list(test)
     found = diagnose(

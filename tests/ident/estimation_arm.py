@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -194,3 +194,12 @@ def true_base(identification: object) -> Array:
         link = int(name[-1])
         values.append(truth()[name] if link < 8 else payload().get(name[:-1], 0.0))
     return np.asarray(base.reduce(np.array(values)))
+
+
+STIFFNESS = (1e4,) * 7
+
+
+def at_the_motors(one: Session) -> Session:
+    """The session with the positions that encoders at the motors of joints of this stiffness read."""
+    position = one.joint.position + one.joint.effort / np.array(STIFFNESS)
+    return replace(one, joint=replace(one.joint, position=position))

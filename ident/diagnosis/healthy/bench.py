@@ -23,6 +23,7 @@ from ident.dynamics.known_arm import known_arm
 from ident.dynamics.structure import Coupling, Side
 from ident.effects import DELAYS, ELASTICITY, PRESLIDING, Shape
 from ident.estimators.physical import cad_prior, lacking_bodies
+from ident.rows.filters import SignalSettings
 
 _BySide = dict[str, Floats]
 _SLOW_S = 0.1
@@ -70,8 +71,14 @@ class DiagnosisBench:
     compliance_std: Floats | None = None
 
 
-def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None) -> NominalArm:
-    """The nominal arm from a reference, else from the arm's description."""
+def nominal_arm(
+    chain: Chain, data: ArmData | None, reference: Reference | None, signals: SignalSettings | None = None
+) -> NominalArm:
+    """The nominal arm from a reference, else from the arm's description.
+
+    signals : of the rows. Where they take the links back from the positions of the motors, their stiffness is the arm's
+    and the rows are those of encoders at the links.
+    """
     data = data or ArmData()
     n = chain.n
     ratio = np.ones(n) if data.gear_ratio is None else np.asarray(data.gear_ratio, dtype=float)
@@ -93,6 +100,8 @@ def nominal_arm(chain: Chain, data: ArmData | None, reference: Reference | None)
             couplings=data.couplings,
             healthy=tuple(e for e in reference.model.effects if e["cause"] != PRESLIDING.cause),
         )
+    if signals is not None and signals.takes_links_back:
+        compliance = 1.0 / np.array(signals.stiffness_nm_rad)
     return NominalArm(chain, compliance, ratio, couplings=data.couplings, stated=compliance)
 
 
@@ -107,7 +116,7 @@ def prepare_bench(
 ) -> DiagnosisBench:
     """Rows, noise and evidence of the nominal arm, its stiffness fitted where nothing better is known."""
     # A fitted arm is near enough, and scaled again in each round it would lose the description.
-    elastic = fit_compliance and np.any(arm.anchor > 0.0)
+    elastic = fit_compliance and not settings.signals.takes_links_back and np.any(arm.anchor > 0.0)
     as_described = np.array_equal(arm.compliance, arm.anchor) or not arm.compliance.any()
     # One torque alone does not tell a twist from friction and inertia.
     fitted = elastic and len({side for one in recordings for side in one.sides}) == 2

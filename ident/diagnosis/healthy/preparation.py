@@ -53,7 +53,8 @@ def preparation(
         known = replace(known, motor_delay_s="estimate", joint_delay_s="estimate")
         settings = replace(settings, signals=known)
     with blamed(broken, chain.joint_names):
-        settings = settled(settings, sessions, chain, couplings, recall=recall)
+        healthy = reference is not None and reference.sets > 0
+        settings = settled(settings, sessions, chain, couplings, healthy=healthy, recall=recall)
         recordings = tuple(
             record(s, k, chain, settings, test=id(s) in held, recall=recall) for k, s in enumerate(everything)
         )

@@ -77,7 +77,7 @@ def signature_bench(
         raise DataError("no session given; name at least one session file")
     couplings = () if arm is None else arm.couplings
     ready = preparation(sessions, (), chain, settings, couplings, reference, broken)
-    known = nominal_arm(chain, arm, reference)
+    known = nominal_arm(chain, arm, reference, ready.settings.signals)
     bench = prepare_bench(
         known, ready.recordings, ready.settings, reference, (), fit_compliance=reference is None
     )

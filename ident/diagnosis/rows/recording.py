@@ -142,15 +142,16 @@ def settled(
     chain: Chain,
     couplings: Sequence[Coupling] = (),
     *,
+    healthy: bool,
     recall: Recall | None = None,
 ) -> DiagnosisSettings:
     """The settings with signals and friction law from the fitted sessions, as `identify` chooses them.
 
-    couplings : of the arm. recall : as for `prepare`.
+    couplings : of the arm. healthy : with sets of a healthy arm, which tell the side of the positions and the stiffness
+    themselves; the positions are then taken as published. recall : as for `prepare`.
     """
-    # A diagnosis tells the side of the positions itself, from sets of a healthy arm or beside other causes.
-    signals = replace(settings.signals.of_coupled(couplings), encoder="link")
-    settings = replace(settings, signals=signals)
+    signals = settings.signals.of_coupled(couplings)
+    settings = replace(settings, signals=replace(signals, encoder="link") if healthy else signals)
     chosen = [session.select(chain.joint_names) for session in sessions]
     payloads = [payload_name(session) for session in chosen]
     sensed = any(bool(session.joint.effort.shape[1]) for session in chosen)
@@ -186,7 +187,7 @@ def settled_for_all(
     Presliding and the friction of slow motion are the drives'; a set whose motion does not show them leaves nothing
     out.
     """
-    first, *others = [settled(settings, sessions, chain, couplings) for sessions in sets]
+    first, *others = [settled(settings, sessions, chain, couplings, healthy=True) for sessions in sets]
     chosen = [one.signals for one in (first, *others)]
     signals = replace(
         first.signals,

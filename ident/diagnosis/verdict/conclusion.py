@@ -506,9 +506,19 @@ def _notes(task: Task, bench: DiagnosisBench, measured: Mapping[str, Floats]) ->
             "no motion repeats within a session: the residual of the model is the only measure of noise, so only "
             "causes of a large part of it are named"
         )
+    if task.settings.signals.takes_links_back:
+        notes.append(
+            "the positions are taken for those of the motors, by what they predict or as stated; the links stand "
+            f"behind them by up to {1e3 * _largest_twist(nominal):.2g} mrad, and a claim of elasticity adds to that"
+        )
     if evidence.drawn:
         notes.append(
             "hardly excited parameters are held near the inertia of the URDF, within 20 %: a wrong URDF would show "
             "as a cause"
         )
     return notes
+
+
+def _largest_twist(nominal: Nominal) -> float:
+    """Largest twist of a joint [rad]."""
+    return max(float(np.max(np.abs(m.joint_torque) * nominal.arm.compliance)) for m in nominal.motions)

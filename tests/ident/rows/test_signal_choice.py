@@ -303,20 +303,11 @@ def test_noisy_positions_have_a_lower_cut_off_than_clean_ones():
     assert (clean, noisy) == (25.0, 5.0)
 
 
-STIFFNESS = (1e4,) * 7
-
-
-def at_the_motors(session: Session) -> Session:
-    """The session with the positions that encoders at the motors read."""
-    position = session.joint.position + session.joint.effort / np.array(STIFFNESS)
-    return dataclasses.replace(session, joint=dataclasses.replace(session.joint, position=position))
-
-
-@pytest.mark.parametrize("stiffness", [None, STIFFNESS], ids=["usual", "stated"])
+@pytest.mark.parametrize("stiffness", [None, arm.STIFFNESS], ids=["usual", "stated"])
 def test_positions_of_the_motors_are_told_from_the_links(stiffness):
     session = arm.session(sensors=sensors(joint=0.02))
     assert chosen(session, SignalSettings(stiffness_nm_rad=stiffness)).settings.encoder == "link"
-    found = chosen(at_the_motors(session), SignalSettings(stiffness_nm_rad=stiffness))
+    found = chosen(arm.at_the_motors(session), SignalSettings(stiffness_nm_rad=stiffness))
     assert found.settings.encoder == "motor"
     assert any("of the motors" in reason for reason in found.reasons)
     np.testing.assert_allclose(np.median(found.settings.stiffness_nm_rad), 1e4, rtol=0.5)
@@ -325,15 +316,15 @@ def test_positions_of_the_motors_are_told_from_the_links(stiffness):
 def test_a_recording_that_states_positions_of_the_motors_needs_no_test():
     session = arm.session(motor=False, sensors=sensors())
     stated = dataclasses.replace(session, metadata={**session.metadata, "encoder": "motor"})
-    found = chosen(stated, SignalSettings(stiffness_nm_rad=STIFFNESS))
+    found = chosen(stated, SignalSettings(stiffness_nm_rad=arm.STIFFNESS))
     assert found.settings.encoder == "motor"
     assert any("as stated" in reason for reason in found.reasons)
 
 
 def test_links_stand_behind_their_motors_by_the_twist():
     session = arm.session(motor=False)
-    settings = SignalSettings(stiffness_nm_rad=STIFFNESS, encoder="motor", cutoff_hz=10.0)
+    settings = SignalSettings(stiffness_nm_rad=arm.STIFFNESS, encoder="motor", cutoff_hz=10.0)
     (link,) = prepare(session, dataclasses.replace(settings, encoder="link")).passages
-    (motor,) = prepare(at_the_motors(session), settings).passages
+    (motor,) = prepare(arm.at_the_motors(session), settings).passages
     np.testing.assert_allclose(motor.joint.q, link.joint.q, atol=1e-6)
     np.testing.assert_allclose(motor.joint.qdd, link.joint.qdd, atol=2e-3)

@@ -485,7 +485,9 @@ def test_what_any_healthy_set_asks_to_leave_out_is_left_out_of_all(monkeypatch: 
         ),
     }
     monkeypatch.setattr(
-        recording, "settled", lambda settings, sessions, *_: replace(settings, signals=chosen[sessions[0]])
+        recording,
+        "settled",
+        lambda settings, sessions, *_, healthy: replace(settings, signals=chosen[sessions[0]]),
     )
     found = recording.settled_for_all(DiagnosisSettings(), [["first"], ["second"]], None)  # type: ignore[list-item, arg-type]
     assert found.signals == replace(chosen["first"], turning_rad=2e-2)
