@@ -17,7 +17,7 @@ from runner.status import write
 from runner.terminal import FiniteRange, ask
 
 if TYPE_CHECKING:
-    from ident.import_log import Guess
+    from ident.import_log import Guess, Known
     from lwr_driver.session import Session
 
 GUESSED = ("yes", "joints", "rate_hz", "torque", "torque_constant", "gear_ratio")
@@ -89,11 +89,8 @@ def read_recordings(
         the columns of all that have them; others get a mapping of their own. Raises ConfigurationError without a URDF,
         or without a confirmation.
     """
-    from ident.dynamics.session_chain import recorded_rests
-    from ident.import_log import Known, guess_mapping, import_log, read_recording
+    from ident.import_log import Known, read_recording
     from ident.import_log.bag import bag_files
-    from ident.import_log.tables import unpacked
-    from lwr_driver.session import read_session
 
     named = () if joints is None else tuple(name.strip() for name in joints.split(","))
 
@@ -102,16 +99,37 @@ def read_recordings(
         return read_recording(path, status=False, motor=side, joints=named, urdf=urdf, base=base, tip=tip)
 
     foreign = [path for path in paths if not (path.suffix == ".mcap" or bag_files(path))]
-    if not foreign:
-        if rate_hz or torque_constant or gear_ratio:
-            raise ConfigurationError(
-                f"{paths[0]} names its joints and quantities; --rate-hz, --torque-constant and --gear-ratio are for "
-                "recordings with guessed columns"
-            )
-        logs = [read(path) for path in paths]
-        for log in logs[1:]:
-            _same_rests(recorded_rests(logs[0].metadata), recorded_rests(log.metadata), log.path)
-        return logs
+    if foreign:
+        known = Known(named, base, tip, rate_hz, torque, torque_constant, gear_ratio)
+        return _read_foreign(paths, foreign, read, urdf, known, folder, yes=yes)
+    if rate_hz or torque_constant or gear_ratio:
+        raise ConfigurationError(
+            f"{paths[0]} names its joints and quantities; --rate-hz, --torque-constant and --gear-ratio are for "
+            "recordings with guessed columns"
+        )
+    from ident.dynamics.session_chain import recorded_rests
+
+    logs = [read(path) for path in paths]
+    for log in logs[1:]:
+        _same_rests(recorded_rests(logs[0].metadata), recorded_rests(log.metadata), log.path)
+    return logs
+
+
+def _read_foreign(
+    paths: Sequence[Path],
+    foreign: Sequence[Path],
+    read: Callable[[Path], Session],
+    urdf: Path | None,
+    known: Known,
+    folder: Path,
+    *,
+    yes: bool,
+) -> list[Session]:
+    """As `read_recordings`, where the `foreign` ones among the paths need a mapping; `read` reads the others."""
+    from ident.import_log import guess_mapping, import_log
+    from ident.import_log.tables import unpacked
+    from lwr_driver.session import read_session
+
     missing = [path for path in foreign if not path.exists()]
     if missing:
         raise DataError(f"{missing[0]}: no such file or folder")
@@ -119,7 +137,6 @@ def read_recordings(
         raise ConfigurationError(
             f"{foreign[0]}: no session log; name the arm's URDF with --urdf to import it"
         )
-    known = Known(named, base, tip, rate_hz, torque, torque_constant, gear_ratio)
     guess = guess_mapping(foreign[0], urdf, known)
     for other in foreign[1:] if guess.mapping.held else ():
         _same_rests(guess.mapping.held or {}, guess_mapping(other, urdf, known).mapping.held or {}, other)

@@ -383,30 +383,37 @@ def space_of(mechanism: Mechanism, geometry: pin.GeometryModel | None) -> tuple[
     names = ["flange distance from axis 1", "flange height"]
     if geometry is None:
         return Space(), tuple(names)
-    to_zero = np.linalg.inv(mechanism.base)
-    to_zero[:3, 3] -= mechanism.translation[0]
-    capsules: dict[int, tuple[int, Array, float]] = {}  # joint frame, segment, radius by shape
-    boxes: dict[int, tuple[Array, Array]] = {}  # half sides, pose by shape
-    # capsules and boxes of each row, and its name
-    pairs: list[tuple[tuple[int, int], str]] = []
-    grounded: list[tuple[int, str]] = []
-    boxed: list[tuple[tuple[int, int], str]] = []
-    ground = -np.inf
-    eased: list[tuple[int, float]] = []
-
-    def capsule(index: int) -> int:
-        if index not in capsules:
-            item = geometry.geometryObjects[index]
-            segment, radius = enclose(item.geometry)
-            joint = int(item.parentJoint)
-            frame = to_zero if joint == 0 else mechanism.links[joint - 1]
-            pose = frame @ np.array(item.placement.homogeneous)
-            capsules[index] = (joint - 1, segment @ pose[:3, :3].T + pose[:3, 3], radius)
-        return list(capsules).index(index)
-
+    shapes = _Shapes(mechanism, geometry)
     for pair in geometry.collisionPairs:
-        indices = (int(pair.first), int(pair.second))
-        shapes = [geometry.geometryObjects[index] for index in indices]
+        shapes.add(int(pair.first), int(pair.second))
+    return shapes.space(), (*names, *shapes.names)
+
+
+class _Shapes:
+    """Capsules and boxes around the shapes of a collision model, and the pairs of them with a distance."""
+
+    def __init__(self, mechanism: Mechanism, geometry: pin.GeometryModel) -> None:
+        self._mechanism, self._objects = mechanism, geometry.geometryObjects
+        self._to_zero = np.linalg.inv(mechanism.base)
+        self._to_zero[:3, 3] -= mechanism.translation[0]
+        self._capsules: dict[int, tuple[int, Array, float]] = {}  # joint frame, segment, radius by shape
+        self._boxes: dict[int, tuple[Array, Array]] = {}  # half sides, pose by shape
+        # Capsules and boxes of each row, and its name.
+        self._pairs: list[tuple[tuple[int, int], str]] = []
+        self._grounded: list[tuple[int, str]] = []
+        self._boxed: list[tuple[tuple[int, int], str]] = []
+        self._ground = -np.inf
+        self._eased: list[tuple[int, float]] = []
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the rows."""
+        return [label for _, label in (*self._pairs, *self._grounded, *self._boxed)]
+
+    def add(self, first: int, second: int) -> None:
+        """A pair of shapes with a distance."""
+        indices = (first, second)
+        shapes = [self._objects[index] for index in indices]
         fixed = [k for k in range(2) if int(shapes[k].parentJoint) == 0]
         label = f"{shapes[0].name} to {shapes[1].name}"
         flat = [k for k in fixed if isinstance(shapes[k].geometry, coal.Halfspace)]
@@ -415,30 +422,47 @@ def space_of(mechanism: Mechanism, geometry: pin.GeometryModel | None) -> tuple[
             half = shapes[flat[0]].geometry
             if not np.allclose(half.n, [0.0, 0.0, 1.0]):
                 raise ConfigurationError(f"{shapes[flat[0]].name}: only a level ground is supported")
-            ground = float((to_zero @ np.array([0.0, 0.0, half.d, 1.0]))[2])
-            grounded.append((capsule(indices[1 - flat[0]]), label))
+            self._ground = float((self._to_zero @ np.array([0.0, 0.0, half.d, 1.0]))[2])
+            self._grounded.append((self._capsule(indices[1 - flat[0]]), label))
         elif solid:
-            box = shapes[solid[0]]
-            pose = to_zero @ np.array(box.placement.homogeneous)
-            boxes[indices[solid[0]]] = (np.array(box.geometry.halfSide), pose)
-            place = list(boxes).index(indices[solid[0]])
-            boxed.append(((capsule(indices[1 - solid[0]]), place), label))
+            box = self._box(indices[solid[0]])
+            self._boxed.append(((self._capsule(indices[1 - solid[0]]), box), label))
         else:
             near = abs(int(shapes[0].parentJoint) - int(shapes[1].parentJoint)) <= _NEAR_JOINTS
             if near and "payload" in (shapes[0].name, shapes[1].name):
-                eased.append((2 + len(pairs), sum(_excess(shape.geometry) for shape in shapes)))
-            pairs.append(((capsule(indices[0]), capsule(indices[1])), label))
-    space = Space(
-        body=np.array([body for body, _, _ in capsules.values()], dtype=np.int64),
-        ends=np.array([ends for _, ends, _ in capsules.values()]).reshape(-1, 2, 3),
-        thickness=np.array([radius for _, _, radius in capsules.values()], dtype=np.float64),
-        pairs=np.array([row for row, _ in pairs], dtype=np.int64).reshape(-1, 2),
-        ground=ground,
-        grounded=np.array([row for row, _ in grounded], dtype=np.int64),
-        box_size=np.array([size for size, _ in boxes.values()]).reshape(-1, 3),
-        box_rotation=np.ascontiguousarray([pose[:3, :3] for _, pose in boxes.values()]).reshape(-1, 3, 3),
-        box_centre=np.array([pose[:3, 3] for _, pose in boxes.values()]).reshape(-1, 3),
-        boxed=np.array([row for row, _ in boxed], dtype=np.int64).reshape(-1, 2),
-        eased=tuple(eased),
-    )
-    return space, (*names, *(label for _, label in (*pairs, *grounded, *boxed)))
+                row = 2 + len(self._pairs)
+                self._eased.append((row, sum(_excess(shape.geometry) for shape in shapes)))
+            self._pairs.append(((self._capsule(first), self._capsule(second)), label))
+
+    def _capsule(self, index: int) -> int:
+        if index not in self._capsules:
+            item = self._objects[index]
+            segment, radius = enclose(item.geometry)
+            joint = int(item.parentJoint)
+            frame = self._to_zero if joint == 0 else self._mechanism.links[joint - 1]
+            pose = frame @ np.array(item.placement.homogeneous)
+            self._capsules[index] = (joint - 1, segment @ pose[:3, :3].T + pose[:3, 3], radius)
+        return list(self._capsules).index(index)
+
+    def _box(self, index: int) -> int:
+        box = self._objects[index]
+        pose = self._to_zero @ np.array(box.placement.homogeneous)
+        self._boxes[index] = (np.array(box.geometry.halfSide), pose)
+        return list(self._boxes).index(index)
+
+    def space(self) -> Space:
+        """The distances of the pairs so far."""
+        capsules, boxes = self._capsules.values(), self._boxes.values()
+        return Space(
+            body=np.array([body for body, _, _ in capsules], dtype=np.int64),
+            ends=np.array([ends for _, ends, _ in capsules]).reshape(-1, 2, 3),
+            thickness=np.array([radius for _, _, radius in capsules], dtype=np.float64),
+            pairs=np.array([row for row, _ in self._pairs], dtype=np.int64).reshape(-1, 2),
+            ground=self._ground,
+            grounded=np.array([row for row, _ in self._grounded], dtype=np.int64),
+            box_size=np.array([size for size, _ in boxes]).reshape(-1, 3),
+            box_rotation=np.ascontiguousarray([pose[:3, :3] for _, pose in boxes]).reshape(-1, 3, 3),
+            box_centre=np.array([pose[:3, 3] for _, pose in boxes]).reshape(-1, 3),
+            boxed=np.array([row for row, _ in self._boxed], dtype=np.int64).reshape(-1, 2),
+            eased=tuple(self._eased),
+        )

@@ -155,14 +155,6 @@ def _session(
     for topic, other in columns.items():
         if other is not None and topic != "/joint_states":
             columns[topic] = _in_order_of(joint, other)
-    phases = tuple(Phase(*item) for item in texts["/experiment/phase"])
-    for before, after in itertools.pairwise(phases):
-        if after.log_time <= before.log_time:
-            raise DataError(
-                f"{source}: /experiment/phase {after.name!r} at {stamp(after.log_time)} follows "
-                f"{stamp(before.log_time)}; "
-                "log times must be strictly increasing"
-            )
     status, model = fixed["/fri/status"].status(), fixed["/fri/controller_model"].controller_model()
     missing = Missing(
         ended=end is not None or metadata is None,
@@ -174,11 +166,6 @@ def _session(
         notes=tuple(notes),
     )
     attachments = {name: data for name, (_, _, data) in scan.attachments.items()}
-    described = texts["/robot_description"]
-    description = described[0][1] if described else _attached_description(source, attachments)
-    if description is not None and not description.lstrip().startswith("<"):
-        # A log must not lead a user of the description to a file of that name.
-        raise DataError(f"{source}: /robot_description begins with {description[:20]!r}, which is no XML")
     session = Session(
         path=scan.path,
         metadata=metadata or {},
@@ -187,14 +174,36 @@ def _session(
         joint=joint,
         motor=columns["/motor_states"],
         command=columns["/joint_command"],
-        phases=phases,
+        phases=_phases(source, texts["/experiment/phase"]),
         status=status,
         controller_model=model,
-        robot_description=description,
+        robot_description=_description(source, texts["/robot_description"], attachments),
         attachments=attachments,
         missing=missing,
     )
     return session if joint_names is None else session.select(joint_names)
+
+
+def _phases(source: str, marks: Sequence[tuple[int, str]]) -> tuple[Phase, ...]:
+    phases = tuple(Phase(*mark) for mark in marks)
+    for before, after in itertools.pairwise(phases):
+        if after.log_time <= before.log_time:
+            raise DataError(
+                f"{source}: /experiment/phase {after.name!r} at {stamp(after.log_time)} follows "
+                f"{stamp(before.log_time)}; log times must be strictly increasing"
+            )
+    return phases
+
+
+def _description(
+    source: str, described: Sequence[tuple[int, str]], attachments: Mapping[str, bytes]
+) -> str | None:
+    """The URDF of the topic, else that of the attachments."""
+    text = described[0][1] if described else _attached_description(source, attachments)
+    if text is not None and not text.lstrip().startswith("<"):
+        # A log must not lead a user of the description to a file of that name.
+        raise DataError(f"{source}: /robot_description begins with {text[:20]!r}, which is no XML")
+    return text
 
 
 def _attached_description(source: str, attachments: Mapping[str, bytes]) -> str | None:

@@ -170,19 +170,7 @@ def import_trace(
     log_time = start + np.rint(alignment.at(trace.time) * slope * 1e9).astype(np.int64)
     inside = (log_time >= joint.log_time[0]) & (log_time <= joint.log_time[-1])
     zero = min(0.0, float(trace.time[0]))
-    motor = JointColumns(
-        topic="/motor_states",
-        names=joint.names,
-        log_time=log_time[inside],
-        publish_time=np.rint((trace.time[inside] - zero) * 1e9).astype(np.int64),
-        sequence=np.flatnonzero(inside),
-        position=np.empty((int(inside.sum()), 0)),
-        velocity=np.empty((int(inside.sum()), 0)),
-        effort=trace.torque[inside],
-        source=str(out),
-    )
-    if (np.diff(motor.log_time) <= 0).any():
-        raise DataError(f"{trace.path}: samples closer than a nanosecond at {stamp(motor.log_time)}")
+    motor = _motor_columns(trace, joint.names, log_time, inside, zero, str(out))
     torques = match_torques(joint, motor) if joint.effort.shape[1] else ()
     wrong = [str(match) for match in torques if match.swapped]
     if wrong:
@@ -206,6 +194,31 @@ def import_trace(
     return TraceImport(
         out, trace.path, joint.names, alignment, len(motor), int((~inside).sum()), jitter, torques
     )
+
+
+def _motor_columns(
+    trace: Trace,
+    names: tuple[str, ...],
+    log_time: NDArray[np.int64],
+    inside: NDArray[np.bool_],
+    zero: float,
+    source: str,
+) -> JointColumns:
+    """The torques of a trace `inside` the session, at their log times (n,) [ns]; zero : of their publish time [s]."""
+    motor = JointColumns(
+        topic="/motor_states",
+        names=names,
+        log_time=log_time[inside],
+        publish_time=np.rint((trace.time[inside] - zero) * 1e9).astype(np.int64),
+        sequence=np.flatnonzero(inside),
+        position=np.empty((int(inside.sum()), 0)),
+        velocity=np.empty((int(inside.sum()), 0)),
+        effort=trace.torque[inside],
+        source=source,
+    )
+    if (np.diff(motor.log_time) <= 0).any():
+        raise DataError(f"{trace.path}: samples closer than a nanosecond at {stamp(motor.log_time)}")
+    return motor
 
 
 def _columns(path: Path, header: list[str], joint_names: Sequence[str]) -> list[int]:

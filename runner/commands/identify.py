@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,6 +16,12 @@ from runner.output import NEW_FOLDER, OUTPUT_FILE, new_folder
 from runner.recordings import GUESSED, guess_options, read_recordings
 from runner.status import StatusLine
 from runner.terminal import NAMED_FILE, PATH, GroupedCommand, hold_json, json_option
+
+if TYPE_CHECKING:
+    from ident.dynamics.kinematics import Chain
+    from ident.estimation.identify import Identification, IdentificationSettings
+    from ident.estimation.mounting import Mounting
+    from lwr_driver.session import Session
 
 _SUMMARIES = {
     AUTO: "of wls and physical, base upright or leaning, the best on held-back motion",
@@ -134,7 +141,7 @@ def command(
     """
     # Imported on use: the help page needs none of them.
     from ident.dynamics.session_chain import session_chain
-    from ident.estimation.identify import identify, known_settings
+    from ident.estimation.identify import known_settings
     from ident.estimation.validate import validate
     from ident.model.model_file import write_model
     from runner.ending import of_estimate, of_folder
@@ -146,8 +153,9 @@ def command(
         of_file,
     )
 
+    file = Path(settings or "settings")
     read = IdentifySettings() if settings is None else IdentifySettings.load(settings)
-    wanted = read.identification(model or 2, estimator, file=Path(settings or "settings"))
+    wanted = read.identification(model or 2, estimator, file=file)
     wanted = replace(wanted, without=(*wanted.without, *without))
     if essential and wanted.essential is None:
         raise ConfigurationError(
@@ -162,21 +170,10 @@ def command(
     logs, tested = logs[: len(sessions)], logs[len(sessions) :]
     chain = session_chain(logs[0], urdf, base=base, tip=tip)
     wanted = known_settings(logs, chain, wanted, model=model)
-    check_spans(logs, wanted, Path(settings or "settings"))
-    mounting = None
+    check_spans(logs, wanted, file)
     status.show("estimating the model")
     with of_file(settings):
-        if estimator == AUTO:
-            from ident.estimation.automatic import choose
-
-            found = choose(logs, chain, wanted, tilt=tilt or None)
-        elif tilt:
-            from ident.estimation.mounting import find_mounting
-
-            mounting = find_mounting(logs, chain, wanted)
-            found = mounting.identification
-        else:
-            found = identify(logs, chain, wanted)
+        found, mounting = _estimate(logs, chain, wanted, estimator, tilt=tilt)
     result = named_model(
         found.essential_model if essential else found.model, logs[0].metadata.get("robot", "") or "arm"
     )
@@ -213,3 +210,21 @@ def command(
         of_estimate(content, out, tables).tell()
     if validation is not None:
         validation.require_all()
+
+
+def _estimate(
+    logs: Sequence[Session], chain: Chain, wanted: IdentificationSettings, estimator: str, *, tilt: bool
+) -> tuple[Identification, Mounting | None]:
+    """The estimate, and the tilt of the base where it was asked for; `auto` has its own in its choice."""
+    if estimator == AUTO:
+        from ident.estimation.automatic import choose
+
+        return choose(logs, chain, wanted, tilt=tilt or None), None
+    if tilt:
+        from ident.estimation.mounting import find_mounting
+
+        mounting = find_mounting(logs, chain, wanted)
+        return mounting.identification, mounting
+    from ident.estimation.identify import identify
+
+    return identify(logs, chain, wanted), None
