@@ -22,13 +22,12 @@ import sys
 import tempfile
 import time
 import venv
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
+from benchmarks.regressor import cpu_s, pinocchio_loop
 from ident.dynamics.base_set import numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import DRIVE
@@ -82,26 +81,6 @@ position: {array: q, unit: rad}
 joint_torque: {array: joint, unit: Nm}
 motor_torque: {array: motor, unit: Nm}
 """
-
-
-def cpu_s(run: Callable[[], Any], repeats: int = 3) -> float:
-    """Smallest CPU time of `repeats` runs after a first one that compiles and warms the caches."""
-    run()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        run()
-        times.append(time.process_time() - start)
-    return min(times)
-
-
-def pinocchio_loop(model: Any, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-    """Python loop over the samples, into one array."""
-    data = model.createData()
-    stacked = np.empty((model.nv, len(q), 10 * model.nv))
-    for k in range(len(q)):
-        stacked[:, k] = pin.computeJointTorqueRegressor(model, data, q[k], qd[k], qdd[k])
-    return stacked
 
 
 def figaroh(states: tuple[np.ndarray, ...], tau: np.ndarray, python: Path | None) -> dict[str, float]:

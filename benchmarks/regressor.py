@@ -46,6 +46,7 @@ def call_us(run: Callable[[], Any], calls: int = 2000) -> float:
 
 
 def pinocchio_loop(model: Any, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+    """Python loop over the samples, into one array."""
     data = model.createData()
     stacked = np.empty((model.nv, len(q), 10 * model.nv))
     for k in range(len(q)):

@@ -29,7 +29,7 @@ _LINES = {
         f"{_KRC}::test_clients_that_know_only_the_bytes",
         f"{_KRC}::test_any_first_count_of_the_client_is_accepted_and_reflected",
         f"{_KRC}::test_superposing_client_does_not_integrate",
-        f"{_KRC}::test_first_command_away_from_the_mirror",
+        "fri/test_krc_drops.py::test_first_command_away_from_the_mirror",
         "fri/test_states.py::test_flag_sets_are_those_that_clients_send",
         "fri/test_krl.py::test_stanford_values_on_the_wire",
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from pathlib import Path
 
 import pytest
@@ -16,3 +17,11 @@ def test_modules_are_found_without_changes_of_the_search_path(package: str) -> N
         source = module.read_text(encoding="utf-8")
         for change in ("sys." + "path", "syspath" + "_prepend"):
             assert change not in source, f"{module}: {change}"
+
+
+def test_no_test_module_takes_from_another() -> None:
+    """What several need is in a module of its own."""
+    for module in (ROOT / "tests").rglob("*.py"):
+        for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+            name = str(node.module) if isinstance(node, ast.ImportFrom) else ""
+            assert not name.rpartition(".")[2].startswith("test_"), f"{module} imports {name}"

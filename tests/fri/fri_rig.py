@@ -14,6 +14,8 @@ V_MAX = np.array([120.0, 120.0, 160.0, 160.0, 250.0, 220.0, 220.0]) * DEG
 A_MAX = np.array([1200.0, 1200.0, 1600.0, 1600.0, 2500.0, 4400.0, 4400.0]) * DEG
 LIMITS = KrcLimits(-Q_MAX, Q_MAX, V_MAX, A_MAX)
 Q_START = np.array([0.5, -0.4, 0.3, 1.2, -0.2, 0.7, 0.1])
+# The largest step that the velocity limits allow in one millisecond.
+STEP = V_MAX * 1e-3
 QUICK = {"window": 40, "minimum_packets": 10, "start_dwell": 5}
 
 
@@ -73,3 +75,12 @@ class Rig:
         self.cycle()
         assert self.session.state is State.CMD
         return self
+
+
+def accelerate(rig: Rig, cycles: int, step: np.ndarray) -> np.ndarray:
+    """Move with a constant `step` per cycle for some cycles; the last command."""
+    q = rig.session.setpoint
+    for _ in range(cycles):
+        q = q + step
+        rig.cycle(q)
+    return np.float32(q).astype(float)

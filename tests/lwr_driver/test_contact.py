@@ -5,16 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from lwr_driver.contact import EXTERNAL_NM, Contact, ContactSettings, ContactWatch, ExpectedArm
+from tests.lwr_driver.contact_rig import HOME, NOTHING, Floats, follow, swing
 from tests.lwr_driver.driver_rig import arm
 
-Floats = NDArray[np.float64]
-HOME = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.8, 0.0])
 LOAD = pin.Inertia(3.34, np.array([0.0, -0.066, 0.066]), np.diag([0.02, 0.02, 0.01]))
-NOTHING = np.zeros(7, np.float32)
 
 
 def model(load: pin.Inertia | None = None) -> pin.Model:
@@ -31,35 +28,9 @@ def watch(settings: ContactSettings | None = None, period_s: float = 1e-3) -> Co
     return made
 
 
-def swing(period_s: float, seconds: float = 1.5) -> tuple[Floats, Floats, Floats]:
-    """A quick motion of all joints about home."""
-    time = np.arange(0.0, seconds, period_s)[:, None]
-    rate = 2.0 * np.pi * np.array([0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3])
-    # The cosine is at rest in the beginning.
-    size = 0.2
-    return (
-        HOME + size * (1.0 - np.cos(rate * time)),
-        size * rate * np.sin(rate * time),
-        size * rate**2 * np.cos(rate * time),
-    )
-
-
 def torques(links: pin.Model, q: Floats, qd: Floats, qdd: Floats) -> Floats:
     data = links.createData()
     return np.array([pin.rnea(links, data, *row) for row in zip(q, qd, qdd, strict=True)])
-
-
-def follow(
-    made: ContactWatch, q: Floats, tau: Floats, estimate: Floats | None = None, gravity: Floats | None = None
-) -> tuple[list[Contact | None], Floats]:
-    """What the watch says in each cycle, and its estimate."""
-    found, external = [], []
-    for row in range(len(q)):
-        other = NOTHING if estimate is None else estimate[row].astype(np.float32)
-        weight = NOTHING if gravity is None else gravity[row].astype(np.float32)
-        found.append(made.update(1, q[row].astype(np.float32), tau[row].astype(np.float32), other, weight))
-        external.append(made.external.copy())
-    return found, np.array(external)
 
 
 @pytest.mark.parametrize("period_s", [1e-3, 5e-3, 10e-3])

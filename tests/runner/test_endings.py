@@ -12,7 +12,7 @@ from ident.diagnosis.outcome.look_alikes import LookAlikes
 from lwr_driver.session import describe
 from runner.commands.commission import _percent
 from runner.ending import compared, numbers_of, of_session
-from tests.lwr_driver.session.test_reader import plain_messages, ros_session
+from tests.lwr_driver.session.session_samples import plain_messages, ros_session
 
 
 def session(motor: float | None, joint: float | None = None) -> dict[str, Any]:

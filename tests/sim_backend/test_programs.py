@@ -15,7 +15,7 @@ from sim_backend.cabinet import Cabinet
 from sim_backend.configuration import load_configuration
 from sim_backend.program import krl_program, program_names
 from sim_backend.robot import Payload, robot_file, truth
-from tests.sim_backend.test_impedance import QUIET, Client
+from tests.sim_backend.cabinet_client import QUIET, Client
 
 
 def cabinet(**settings: object) -> Cabinet:

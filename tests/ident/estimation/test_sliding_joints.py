@@ -12,7 +12,7 @@ from ident.estimation.identify import IdentificationSettings, identify
 from ident.estimation.validate import validate
 from ident.screening.channels import check_channels
 from lwr_driver.listing import text_of
-from tests.ident.screening.test_screen import TIMES, of_joints
+from tests.ident.screening.torque_sessions import TIMES, of_joints
 
 
 def recorded(phase: float):

@@ -39,24 +39,7 @@ from ident.estimators.covariance import (
 )
 from ident.estimators.least_squares import class_variances
 from ident.estimators.problem import Nuisance
-from tests.ident.regression_problems import ar1, design, problem
-
-CHI = np.linspace(-2.0, 2.5, 12)
-
-
-def noisy(seed: int = 1, scale: tuple[float, ...] = (0.05, 0.3, 1.0), **changes: int) -> Problem:
-    matrices = design(**changes)
-    random = np.random.default_rng(seed)
-    noise = [scale[k % 3] * random.normal(size=len(m)) for k, m in enumerate(matrices)]
-    return problem(matrices, CHI, noise)
-
-
-def stack(case: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All rows, targets and the class of each row."""
-    matrix = np.vstack([group.matrix for group in case.groups])
-    target = np.concatenate([group.target for group in case.groups])
-    return matrix, target, np.repeat(case.class_of_group, [len(g.target) for g in case.groups])
-
+from tests.ident.regression_problems import BODY, CHI, ar1, body_prior, design, noisy, problem, stack
 
 # -- problems ------------------------------------------------------------------------------------------------
 
@@ -510,20 +493,6 @@ def test_the_covariance_of_mixing_is_that_of_a_linear_estimate() -> None:
 
 
 # -- bodies --------------------------------------------------------------------------------------------------
-
-BODY = from_com(2.0, [0.05, -0.02, 0.1], np.diag([0.02, 0.018, 0.006]))
-
-
-def body_prior(relative_std: float = 0.2, **changes: np.ndarray) -> BodyPrior:
-    """Two bodies and two drive parameters, seen as they are."""
-    inertial = np.array([BODY, 0.5 * BODY])
-    settings = {
-        "projection": np.eye(22),
-        "bodies": np.arange(20).reshape(2, 10),
-        "nonnegative": np.array([20, 21]),
-        "inertial": inertial,
-    }
-    return BodyPrior(**{**settings, **changes}, relative_std=relative_std)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("metric", ["pullback", "euclidean"])

@@ -31,8 +31,7 @@ from ident.estimators.estimate import (
 )
 from ident.estimators.least_squares import _loss, _scales, class_variances, consumed_parameters, factor_of
 from ident.estimators.problem import Nuisance, _gram_factor, _listed
-from tests.ident.estimators.test_against_definitions import CHI, noisy, stack
-from tests.ident.regression_problems import design, problem
+from tests.ident.regression_problems import CHI, design, noisy, problem, stack
 
 # -- estimates -----------------------------------------------------------------------------------------------
 

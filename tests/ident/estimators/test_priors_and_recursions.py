@@ -32,8 +32,7 @@ from ident.estimators.prior import Disagreement
 from ident.estimators.recursive import _mix, instants
 from ident.estimators.registry import ESTIMATORS
 from tests.ident import estimation_arm as arm
-from tests.ident.estimators.test_against_definitions import BODY, CHI, body_prior, noisy, stack
-from tests.ident.regression_problems import design, problem
+from tests.ident.regression_problems import BODY, CHI, body_prior, design, noisy, problem, stack
 
 # -- priors --------------------------------------------------------------------------------------------------
 

@@ -28,7 +28,7 @@ from lwr_driver.configuration import parse
 from lwr_driver.session import read_session
 from lwr_driver.session.messages import JOINT_STATE, STRING
 from runner.cli import main
-from tests.ident.import_log.test_import_log import PLAIN, mapping, write_csv
+from tests.ident.import_log.plain_logs import PLAIN, mapping, write_csv
 from tests.ident.stock_panda import JOINTS, stock_panda
 
 N = 40

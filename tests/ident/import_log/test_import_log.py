@@ -18,38 +18,11 @@ from ident.dynamics.session_chain import session_chain
 from ident.import_log import LogMapping, import_log
 from ident.import_log.tables import read_text
 from ident.rows.prepare import prepare
-from lwr_driver.configuration import CONFIGS, parse
+from lwr_driver.configuration import CONFIGS
 from lwr_driver.session import read_session
 from lwr_driver.session.session import summarise
 from runner.cli import main
-
-JOINTS = ["a", "b"]
-PLAIN: dict[str, Any] = {
-    "robot": "bench arm",
-    "joints": JOINTS,
-    "time": {"column": "t", "file": "arm.csv"},
-    "position": {"file": "arm.csv", "columns": ["qa", "qb"], "unit": "rad"},
-    "joint_torque": {"file": "arm.csv", "columns": ["ta", "tb"], "unit": "Nm"},
-}
-
-
-def mapping(**changes: Any) -> LogMapping:
-    return parse(LogMapping, PLAIN | changes, "mapping.yaml")
-
-
-def write_csv(folder: Path, rows: int = 4, name: str = "arm.csv", **columns: Any) -> Path:
-    table = {
-        "t": np.arange(rows) * 0.01,
-        "qa": np.linspace(0, 1, rows),
-        "qb": np.linspace(1, 2, rows),
-        "ta": np.linspace(-1, 1, rows),
-        "tb": np.linspace(3, 4, rows),
-    } | columns
-    lines = [",".join(table)]
-    for row in zip(*table.values(), strict=True):
-        lines.append(",".join(value if isinstance(value, str) else repr(float(value)) for value in row))
-    (folder / name).write_text("\n".join(lines) + "\n")
-    return folder
+from tests.ident.import_log.plain_logs import PLAIN, mapping, write_csv
 
 
 def test_plain_columns_arrive_bit_for_bit(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,37 +17,8 @@ from ident.rows.data_quality import (
     stale,
     stuck_at,
 )
-from lwr_driver.session import JointColumns, Session
-
-RATE = 250.0
-COUNT = 2000
-
-
-def columns(
-    effort: np.ndarray, position: np.ndarray | None = None, sequence: np.ndarray | None = None
-) -> JointColumns:
-    """A channel of two joints that swing, with the efforts (n, 2)."""
-    time = np.arange(len(effort)) / RATE
-    if position is None:
-        position = np.column_stack([np.sin(time), np.cos(1.3 * time)])
-    stamps = np.rint(time * 1e9).astype(np.int64)
-    sequence = np.arange(1, len(effort) + 1) if sequence is None else sequence
-    empty = np.zeros((len(effort), 0))
-    return JointColumns(
-        "/joint_states", ("a", "b"), stamps + 10**15, stamps, sequence, position, empty, effort
-    )
-
-
-def noisy(seed: int = 0, count: int = COUNT) -> np.ndarray:
-    random = np.random.default_rng(seed)
-    time = np.arange(count) / RATE
-    return np.column_stack([10.0 * np.sin(time), 5.0 * np.cos(2.0 * time)]) + 0.05 * random.normal(
-        size=(count, 2)
-    )
-
-
-def session(joint: JointColumns, motor: JointColumns | None = None) -> Session:
-    return Session(Path("run.mcap"), {}, {}, joint.names, joint, motor, None, ())
+from lwr_driver.session import JointColumns
+from tests.ident.rows.noisy_channels import COUNT, RATE, columns, noisy, session
 
 
 def test_without_a_counter_samples_missing_in_an_even_clock_are_lost():

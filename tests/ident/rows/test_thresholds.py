@@ -20,7 +20,7 @@ from ident.rows.data_quality import (
     stale,
     stuck_at,
 )
-from tests.ident.rows.test_data_quality import RATE, columns, noisy, session
+from tests.ident.rows.noisy_channels import RATE, columns, noisy, session
 
 STEP = 1e-3
 

@@ -39,6 +39,7 @@ from ident.screening.positions import position_errors
 from ident.screening.screen import _in_bands, require_sound, screen, without_dead
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session
+from tests.ident.screening.torque_sessions import TIMES, of_joints
 
 SENSORS = Sensors(position=2e-5, joint=0.03, motor=0.1, motor_step_s=0.012)
 
@@ -250,26 +251,6 @@ def test_a_gain_of_a_light_wrist_is_no_matter_of_bodies_without_measure(pair: li
     (gain,) = doubts(without("motor", scaled("joint", "effort", 1.3, "A5"))(pair[:1]))
     assert (gain.channel, gain.joints) == ("joint torque", ("A5",))
     assert float(gain.seen.split()[1]) == pytest.approx(1.3, rel=0.03)
-
-
-TIMES = np.arange(0.0, 20.0, 0.004)
-
-
-def of_joints(q: np.ndarray, effort: np.ndarray) -> Session:
-    """A session of the joints J1, J2, ... at `TIMES` with their joint torques alone."""
-    whole, random, stamps = session(rate_hz=250.0), np.random.default_rng(0), np.rint(1e9 * TIMES)
-    names = tuple(f"J{number + 1}" for number in range(q.shape[1]))
-    columns = replace(
-        whole.joint,
-        names=names,
-        log_time=stamps.astype(np.int64),
-        publish_time=stamps.astype(np.int64),
-        sequence=np.arange(1, len(TIMES) + 1),
-        position=q + 1e-5 * random.normal(size=q.shape),
-        velocity=np.zeros((len(TIMES), 0)),
-        effort=effort + 0.05 * random.normal(size=q.shape),
-    )
-    return replace(whole, joint_names=names, joint=columns, motor=None, phases=())
 
 
 def test_the_sign_of_a_single_joint_shows_by_its_inertia() -> None:

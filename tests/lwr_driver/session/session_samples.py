@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap_ros2.writer import Writer as RosWriter
 from numpy.typing import NDArray
 
 from lwr_driver.ring import NO_PHASE, ROW
 from lwr_driver.session import SessionWriter, session_metadata
+from lwr_driver.session.messages import JOINT_STATE
 
 JOINTS = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")
 EPOCH = 1_700_000_000 * 10**9
@@ -81,3 +83,35 @@ def rows(count: int, first: int = 100) -> NDArray[Any]:
     msr["krl_real"][:, :7] = torque[cycle // 12 * 12] * 2.0
     result["cmd"]["jnt_pos"] = position + 0.25
     return result
+
+
+def ros_session(path, messages, *, topic="/joint_states", **options):
+    """A log of another tool, written with `mcap_ros2`; messages are (log time, JointState dict)."""
+    with open(path, "wb") as file:
+        writer = RosWriter(file, **options)
+        schema = writer.register_msgdef(JOINT_STATE.name, JOINT_STATE.text)
+        for number, (log_time, message) in enumerate(messages):
+            writer.write_message(topic, schema, message, log_time, log_time, number)
+        writer.finish()
+
+
+def joint_state(log_time, names, position, effort, velocity=(), frame=""):
+    stamp = {"sec": log_time // 10**9, "nanosec": log_time % 10**9}
+    header = {"stamp": stamp, "frame_id": frame}
+    return {
+        "header": header,
+        "name": list(names),
+        "position": list(position),
+        "velocity": list(velocity),
+        "effort": list(effort),
+    }
+
+
+def plain_messages(count, names=("a", "b", "c")):
+    position, torque = signals(count, len(names))
+    times = [EPOCH + 1_000_000 * row for row in range(count)]
+    return (
+        [(time, joint_state(time, names, position[row], torque[row])) for row, time in enumerate(times)],
+        position,
+        torque,
+    )

@@ -16,7 +16,16 @@ from fri.errors import DataError
 from lwr_driver.session import SessionWriter, describe, read_session
 from lwr_driver.session.messages import JOINT_STATE, STRING
 from lwr_driver.session.scan import Scan
-from tests.lwr_driver.session.session_samples import EPOCH, JOINTS, METADATA, signals, write_session
+from tests.lwr_driver.session.session_samples import (
+    EPOCH,
+    JOINTS,
+    METADATA,
+    joint_state,
+    plain_messages,
+    ros_session,
+    signals,
+    write_session,
+)
 
 
 def test_what_was_written_is_read(tmp_path):
@@ -82,38 +91,6 @@ def test_the_clock_of_an_emulator_is_no_date(tmp_path):
     for text in (str(describe(path)), repr(read_session(path))):
         assert "emulated clock, 1.999 s" in text
         assert "2020" not in text
-
-
-def ros_session(path, messages, *, topic="/joint_states", **options):
-    """A log of another tool, written with `mcap_ros2`; messages are (log time, JointState dict)."""
-    with open(path, "wb") as file:
-        writer = RosWriter(file, **options)
-        schema = writer.register_msgdef(JOINT_STATE.name, JOINT_STATE.text)
-        for number, (log_time, message) in enumerate(messages):
-            writer.write_message(topic, schema, message, log_time, log_time, number)
-        writer.finish()
-
-
-def joint_state(log_time, names, position, effort, velocity=(), frame=""):
-    stamp = {"sec": log_time // 10**9, "nanosec": log_time % 10**9}
-    header = {"stamp": stamp, "frame_id": frame}
-    return {
-        "header": header,
-        "name": list(names),
-        "position": list(position),
-        "velocity": list(velocity),
-        "effort": list(effort),
-    }
-
-
-def plain_messages(count, names=("a", "b", "c")):
-    position, torque = signals(count, len(names))
-    times = [EPOCH + 1_000_000 * row for row in range(count)]
-    return (
-        [(time, joint_state(time, names, position[row], torque[row])) for row, time in enumerate(times)],
-        position,
-        torque,
-    )
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

@@ -19,7 +19,7 @@ from runner.contact import ContactPlan, expected_arm
 from runner.experiment_file import Experiment
 from runner.files import begin, gather
 from sim_backend.robot import truth
-from tests.lwr_driver.test_contact import follow, swing
+from tests.lwr_driver.contact_rig import follow, swing
 from tests.runner.experiment.experiment_rig import experiment_file, run
 
 
