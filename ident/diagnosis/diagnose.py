@@ -14,6 +14,7 @@ from ident.diagnosis.healthy.bench import (
     ArmData,
     DiagnosisBench,
     again_with,
+    known_drives,
     nominal_arm,
 )
 from ident.diagnosis.healthy.channel_delays import sides_apart
@@ -74,8 +75,8 @@ def diagnose(
         reference = Reference.of(as_model(reference, "reference"))
     if not sessions:
         raise DataError("no session given; name at least one session file")
-    couplings = () if arm is None else arm.couplings
-    ready = preparation(sessions, test, chain, settings, couplings, reference)
+    arm = known_drives(arm, reference)
+    ready = preparation(sessions, test, chain, settings, arm.couplings, reference)
     settings, recordings, broken = ready.settings, ready.recordings, ready.broken
     with blamed(broken, chain.joint_names):
         nominal = nominal_arm(chain, arm, reference, settings.signals)

@@ -231,7 +231,9 @@ def _ending(
         if side in found.noise
     ]
     elastic = bool((found.compliance > 0.0).any())
-    loudest = sorted(found.null.items(), key=lambda item: -item[1])[:_LOUDEST]
+    # Without the kinds of nameless functions, of which each is at most that of any.
+    whole = [item for item in found.null.items() if " " not in item[0][0]]
+    loudest = sorted(whole, key=lambda item: -item[1])[:_LOUDEST]
     listed = ", ".join(
         f"{cause}{f' {names[joint]}' if joint >= 0 else ''} {gain:.0f}" for (cause, joint), gain in loudest
     )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.diagnosis import ArmData, Diagnosis, DiagnosisSettings, Reference, diagnose
+from ident.diagnosis.healthy.bench import known_drives
 from ident.diagnosis.outcome.claims_in_words import SURE
 from ident.diagnosis.outcome.look_alikes import LookAlikes, Place, look_alikes
 from ident.diagnosis.outcome.statements import Statements, statements
@@ -147,7 +148,7 @@ def study(
     Raises DataError for unusable sessions.
     """
     healthy = None if reference is None else Reference.of(reference)
-    data = arm_data(arm, chain) if data is None else data
+    data = known_drives(arm_data(arm, chain) if data is None else data, healthy)
     everything = sorted([*sessions, *test], key=lambda s: s.start)
     replay = None
     if simulate:

@@ -71,6 +71,18 @@ class DiagnosisBench:
     compliance_std: Floats | None = None
 
 
+def known_drives(data: ArmData | None, reference: Reference | None) -> ArmData:
+    """The arm's data with the gear ratios and couplings that it was commissioned with."""
+    data = data or ArmData()
+    if reference is None:
+        return data
+    return replace(
+        data,
+        gear_ratio=data.gear_ratio if reference.gear_ratio is None else reference.gear_ratio,
+        couplings=reference.model.structure.couplings or data.couplings,
+    )
+
+
 def nominal_arm(
     chain: Chain, data: ArmData | None, reference: Reference | None, signals: SignalSettings | None = None
 ) -> NominalArm:
@@ -79,7 +91,7 @@ def nominal_arm(
     signals : of the rows. Where they take the links back from the positions of the motors, their stiffness is the arm's
     and the rows are those of encoders at the links.
     """
-    data = data or ArmData()
+    data = known_drives(data, reference)
     n = chain.n
     ratio = np.ones(n) if data.gear_ratio is None else np.asarray(data.gear_ratio, dtype=float)
     compliance = np.zeros(n) if data.stiffness is None else 1.0 / np.asarray(data.stiffness, dtype=float)

@@ -369,6 +369,7 @@ def _reference(
         null={},
         sets=len(days),
         encoder=arm.encoder,
+        gear_ratio=arm.gear_ratio if np.any(arm.gear_ratio != 1.0) else None,
         presliding=arm.presliding,
         far=arm.far,
         far_share=arm.far_share,

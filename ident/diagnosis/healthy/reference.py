@@ -30,7 +30,7 @@ from ident.diagnosis.rows.nominal_arm import GAIN_STD
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import LINK_FRICTION, PER_LINK, split_name
 from ident.dynamics.structure import EncoderSide
-from ident.effects import EFFECTS, find_effect
+from ident.effects import EFFECTS, Effect, find_effect
 from ident.estimators.estimate import fisher_limit
 from ident.model import DynamicModel, write_model
 
@@ -77,7 +77,7 @@ class Reference:
     candidate, by shape of its grid: the fall of the chi-square for a unit of its coefficients. usual : size of each
     candidate on the healthy arm. left : largest rms (n,) [Nm] by side of a held-out session of a healthy set, beside
     what differs from day to day; empty if unknown. lost : largest share of lost, repeated and stale samples of a
-    healthy session, by channel.
+    healthy session, by channel. gear_ratio : (n,) of the drives, None if unknown.
     """
 
     model: DynamicModel
@@ -102,6 +102,7 @@ class Reference:
     usual: Mapping[tuple[str, int], UsualSize] = field(default_factory=dict)
     left: Mapping[str, Floats] = field(default_factory=dict)
     lost: Mapping[str, float] = field(default_factory=dict)
+    gear_ratio: Floats | None = None
 
     @property
     def unknown_stiffness(self) -> tuple[str, ...]:
@@ -160,9 +161,9 @@ class Reference:
             delay_std = {side: float(v) for side, v in stored.get("delay_std_s", {}).items()}
             lost = {channel: float(v) for channel, v in stored.get("lost", {}).items()}
             sets, encoder = int(stored["sets"]), str(stored["encoder"])
-            presliding, far, far_share, compliance_std = (
+            presliding, far, far_share, compliance_std, gear_ratio = (
                 np.array(stored[name], dtype=np.float64) if stored.get(name) else None
-                for name in (_LENGTHS, "far", "far_share", "compliance_std")
+                for name in (_LENGTHS, "far", "far_share", "compliance_std", "gear_ratio")
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ConfigurationError(
@@ -199,6 +200,7 @@ class Reference:
             usual=usual,
             left=left,
             lost=lost,
+            gear_ratio=gear_ratio,
         )
 
     def stored(self) -> dict[str, Any]:
@@ -230,6 +232,7 @@ class Reference:
                 _LENGTHS: _listed(self.presliding),
                 "far": _listed(self.far),
                 "far_share": _listed(self.far_share),
+                "gear_ratio": _listed(self.gear_ratio),
             }
         }
 
@@ -252,7 +255,7 @@ class Reference:
         form.
         """
         found = {
-            key: one.by_days if find_effect(key[0]).together else one.by_joints
+            key: one.by_days if _effect(key[0]).together else one.by_joints
             for key, one in self.days().items()
         }
         # On a healthy arm a cause reaches at least the gain of its special cases, and is not counted beside them.
@@ -272,7 +275,8 @@ class Reference:
         for (cause, _), gain in self.null.items():
             by_cause.setdefault(cause, []).append(gain)
         # The gain from noise alone has no such tail; the least gain of a claim accounts for it.
-        noise = float(np.median(list(self.null.values()))) if self.null else 0.0
+        each = [gain for (cause, _), gain in self.null.items() if " " not in cause]
+        noise = float(np.median(each)) if each else 0.0
         sets = self.sets + _AS_SETS
         by_joints, by_days = (
             further * fisher_limit(_ONE_IN, 1, count) for count in (sets, max(self.sets, LEAST_SETS))
@@ -375,6 +379,11 @@ def _listed(values: Floats | None) -> list[float] | None:
 def symbol_of(name: str) -> str:
     """Symbol of a base parameter: without joint and mark of regrouping."""
     return name.rstrip("R").rstrip("0123456789")
+
+
+def _effect(cause: str) -> Effect:
+    """The effect of a cause, of a kind of nameless function that of its side."""
+    return find_effect(cause.partition(" ")[0])
 
 
 def _split(key: str) -> tuple[str, int]:

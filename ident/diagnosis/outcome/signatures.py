@@ -19,7 +19,13 @@ from fri.errors import DataError
 from ident.diagnosis.causes.candidates import Candidate, Trial
 from ident.diagnosis.causes.selection import select
 from ident.diagnosis.gain.products import Floats, Key, Rows
-from ident.diagnosis.healthy.bench import ArmData, DiagnosisBench, nominal_arm, prepare_bench
+from ident.diagnosis.healthy.bench import (
+    ArmData,
+    DiagnosisBench,
+    known_drives,
+    nominal_arm,
+    prepare_bench,
+)
 from ident.diagnosis.healthy.preparation import preparation
 from ident.diagnosis.healthy.reference import Reference
 from ident.diagnosis.rows.broken_data import BrokenChannel
@@ -75,8 +81,8 @@ def signature_bench(
     settings = settings or DiagnosisSettings()
     if not sessions:
         raise DataError("no session given; name at least one session file")
-    couplings = () if arm is None else arm.couplings
-    ready = preparation(sessions, (), chain, settings, couplings, reference, broken)
+    arm = known_drives(arm, reference)
+    ready = preparation(sessions, (), chain, settings, arm.couplings, reference, broken)
     known = nominal_arm(chain, arm, reference, ready.settings.signals)
     bench = prepare_bench(
         known, ready.recordings, ready.settings, reference, (), fit_compliance=reference is None
