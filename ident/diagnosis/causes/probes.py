@@ -8,6 +8,7 @@ extended model, or is reported by its variables; a large one casts doubt on the 
 
 from __future__ import annotations
 
+import re
 from bisect import insort
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -42,6 +43,10 @@ _LEAST_ROWS = 100
 _RIDGE = 1e-3
 # Least explained share of the noise; generic functions find a little everywhere.
 _LEAST_INFLATION = 0.012
+# Least explained share of the noise of a large function: with it the row's error is a third above the noise.
+_LARGE = (4.0 / 3.0) ** 2 - 1.0
+# Instead of a function's name.
+_ANY = "any"
 # Least gain of a function beside a line, over that of the line: its frequency is known to a bin, and what is left of it
 # is no function of the motion.
 _OF_LINE = 0.1
@@ -221,7 +226,7 @@ def find_remainders(
 ) -> tuple[Remainder, ...]:
     """Remainders beside the columns of the evidence, largest first; at most two variables each.
 
-    null : limits of their gain on the healthy arm, by name of the nameless term.
+    null : limits of their gain on the healthy arm, by name of the nameless term, and by the kind of function.
     """
     found = []
     evidence, variables = dictionary.evidence, hats_of(dictionary)
@@ -230,9 +235,12 @@ def find_remainders(
         for name, rows in one.groups.items():
             padded = evidence.padded(rows)
             prepared[name] = rows, padded, evidence.alone(padded)
-        least = max(settings.least_gain, (null or {}).get((NAMELESS[one.side].cause, one.joint), 0.0))
+        limits = {
+            name: max(settings.least_gain, _limit(null or {}, one.side, one.joint, name))
+            for name in (_ANY, *one.groups)
+        }
         with evidence.beside(evidence.extra):
-            remainder = _one(evidence, least, prepared, one.line, one.side, one.joint, variables)
+            remainder = _one(evidence, limits, prepared, one.line, one.side, one.joint, variables)
         if remainder is not None:
             found.append(remainder)
     return tuple(sorted(found, key=lambda r: -r.gain))
@@ -240,30 +248,36 @@ def find_remainders(
 
 def _one(
     evidence: Evidence,
-    least_gain: float,
+    limits: Mapping[str, float],
     prepared: dict[str, tuple[Rows, dict[Key, Floats], Products]],
     line: tuple[float, Rows, int] | None,
     side: str,
     joint: int,
     variables: Mapping[str, Curve],
 ) -> Remainder | None:
-    """The remainder of a joint from its line and its `prepared` groups of columns."""
+    """The remainder of a joint from its line and its `prepared` groups of columns.
+
+    limits : least gain of any, and of a large one of each name: a healthy arm with other motions has small functions
+    of kinds that its sets do not show.
+    """
     taken: list[tuple[str, Score, Rows]] = []
-    fixed, line_hz = list(evidence.extra), 0.0
+    fixed, line_hz, least_gain = list(evidence.extra), 0.0, limits[_ANY]
+    beside_line = 0.0
     if line is not None:
         frequency, waves, choices = line
         score = evidence.score(evidence.padded(waves))
         least = least_gain + 2.0 * (len(score.coefficients) + np.log(choices))
         if score.gain > least and score.inflation > _LEAST_INFLATION:
             line_hz = frequency
-            least_gain = max(least_gain, _OF_LINE * score.gain)
+            beside_line = _OF_LINE * score.gain
             taken.append(("time", score, waves))
             evidence.replace([*fixed, waves])
     for _ in range(2):
         best: tuple[str, Score, Rows] | None = None
         for name, (rows, padded, known) in prepared.items():
             score = evidence.score(padded, ridge=_RIDGE, known=known)
-            least = max(least_gain + 2.0 * KNOTS, 0.0 if best is None else best[1].gain)
+            limit = max(limits[name if score.inflation > _LARGE else _ANY], beside_line)
+            least = max(limit + 2.0 * KNOTS, 0.0 if best is None else best[1].gain)
             if score.gain > least and score.inflation > _LEAST_INFLATION:
                 best = name, score, rows
         if best is None:
@@ -288,14 +302,31 @@ def _term(name: str, score: Score, rows: Rows, variables: Mapping[str, Curve]) -
 
 def remainder_gains(dictionary: Dictionary) -> dict[tuple[str, int], float]:
     """Largest gain of a function of the motion or of a line beside the columns of the evidence, by the name of the
-    nameless term and the joint from 0."""
+    nameless term and the joint from 0, and of each kind of function."""
     found = {}
     evidence = dictionary.evidence
     for one in _searched(dictionary, hats_of(dictionary)):
         scores = [evidence.score(evidence.padded(rows), ridge=_RIDGE) for rows in one.groups.values()]
         scores += [] if one.line is None else [evidence.score(evidence.padded(one.line[1]))]
         found[NAMELESS[one.side].cause, one.joint] = max(0.0, *(score.gain for score in scores))
+        for name, score in zip(one.groups, scores, strict=False):
+            kind = _kind(one.side, one.joint, name)
+            found[kind] = max(found.get(kind, 0.0), score.gain)
     return found
+
+
+def _kind(side: str, joint: int, name: str) -> tuple[str, int]:
+    """Kind of a function of some variables, of the joint (from 0) itself or of another one, and the joint."""
+    variable, _, factor = name.partition(" ")
+    of = variable.rstrip("0123456789")
+    whose = "" if variable == of else "own " if variable == f"{of}{joint + 1}" else "other "
+    return f"{NAMELESS[side].cause} {whose}{of} {re.sub('[0-9]', '', factor)}".rstrip(), joint
+
+
+def _limit(null: Null, side: str, joint: int, name: str) -> float:
+    """Of a function on the healthy arm, by its kind; a reference of an earlier version has that of any."""
+    any_limit = null.get((NAMELESS[side].cause, joint), 0.0)
+    return any_limit if name == _ANY else null.get(_kind(side, joint, name), any_limit)
 
 
 def hats_of(dictionary: Dictionary, only: str | None = None) -> dict[str, Curve]:
