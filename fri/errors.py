@@ -85,7 +85,7 @@ class FileError(ConfigurationError, OSError):
 
 @contextmanager
 def naming(path: object) -> Iterator[None]:
-    """Name `path` in an error of the operating system that names no file, as that of a full disk."""
+    """Name `path` in an error of the operating system without a file name, such as a full disk."""
     try:
         yield
     except OSError as error:

@@ -60,7 +60,7 @@ else:
 
 
 class Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """Safe dumper, by libyaml where PyYAML has it, that quotes every text `Loader` would read as a number."""
+    """Safe dumper, by libyaml where PyYAML has it. It quotes every text that `Loader` would read as a number."""
 
 
 for _kind in (Loader, Dumper):

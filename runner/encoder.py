@@ -23,8 +23,8 @@ from sim_backend.configuration import load_configuration
 def encoder_of(session: Session, folder: Path, models: Iterable[DynamicModel]) -> EncoderSide | None:
     """Where the arm of a session has its encoders; None if nothing tells.
 
-    Told by the settings of the emulated arm, else by its healthy baseline (`lwr-run commission`) or by the signals of
-    one of `models`, else by an effect found in them with the place as its form. folder : of the session's results.
+    Told by the settings of the emulated arm, else by its healthy-arm baseline (`lwr-run commission`) or by the signals
+    of one of `models`, else by an effect found in them with the place as its form. folder : of the session's results.
     """
     models = list(models)
     experiment = _experiment(session, folder)
@@ -37,9 +37,9 @@ def encoder_of(session: Session, folder: Path, models: Iterable[DynamicModel]) -
             if experiment.diagnosis.reference is not None:
                 models.append(read_model(find(experiment.diagnosis.reference, beside=experiment.folder)))
     for model in models:
-        baseline = Reference.of(model)
-        if baseline.sets:
-            return baseline.encoder
+        reference = Reference.of(model)
+        if reference.sets:
+            return reference.encoder
         if positions_of_motors(model):
             return "motor"
     for entry in (entry for model in models for entry in model.effects):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError, DataError
 from ident.dynamics.known_arm import known_arm
-from ident.dynamics.structure import EncoderSide
+from ident.dynamics.structure import EncoderSide, TorqueSide
 from ident.model.model_file import read_model
 from ident.rows.sessions import payload_name
 from lwr_driver.arm import Arm
@@ -57,7 +57,7 @@ class MotionReplay:
     arm: Arm
     payload: Payload | None
     runs: Mapping[Simulated, Replayed]
-    side: Literal["joint", "motor"]
+    side: TorqueSide
     notes: tuple[str, ...] = ()
     encoder: EncoderSide = "link"
 
@@ -169,7 +169,7 @@ def motion_replay(
         if replay(one, [log]) is None:
             raise DataError(f"{log.path.name}: {'; '.join(replay.notes)}")
     runs = {name: _without_end(done) for name, (_, done) in zip(LABELS, replay.first, strict=False)}
-    side: Literal["joint", "motor"] = "motor" if runs["base"].joint is None else "joint"
+    side: TorqueSide = "motor" if runs["base"].joint is None else "joint"
     if getattr(runs["base"], side) is None:
         raise DataError(f"{log.path.name}: neither joint nor motor torque is in the log and the model")
     notes = (*replay.notes, *([_UNKNOWN] if place is None else []))

@@ -369,7 +369,7 @@ def _moved(names: tuple[str, ...], before: Vector, after: Vector) -> str:
 
 
 def _failure(error: LwrError, path: Path) -> LwrError:
-    """The error with what it means for the next attempt and where the log is."""
+    """The error, with its meaning for the next attempt and the place of the log."""
     text = f"{error}. Nothing resumes by itself; the same command begins at the present pose. Log: {path}"
     failed = type(error)(text)
     failed.rows = error.rows

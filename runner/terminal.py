@@ -146,7 +146,7 @@ def ask(question: str) -> bool:
 
 
 class Verb(click.Command):
-    """A command whose inputs must exist and whose outputs must not, checked before its work.
+    """A command with a check of its paths before its work: inputs must exist, outputs must not.
 
     `--verbose` belongs to each, `--force` to those with outputs.
     """

@@ -48,6 +48,9 @@ from ident.dynamics.parameters import (
 from ident.dynamics.regressor import check_states, fill_rigid
 
 Side = Literal["motor", "joint", "difference"]
+"""Rows of a model: motor torques, joint torques, or their difference."""
+TorqueSide = Literal["motor", "joint"]
+"""The side of the gear that a measured torque is of."""
 EncoderSide = Literal["link", "motor"]
 """The side of an elastic joint that its positions are of."""
 MODEL_SIDES: dict[int, tuple[Side, ...]] = {1: ("joint",), 2: ("motor", "joint"), 3: ("difference",)}

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
 from ident.dynamics.parameters import joint_unit
-from ident.dynamics.structure import EncoderSide
+from ident.dynamics.structure import EncoderSide, TorqueSide
 from ident.effects.motion import ArmMotion, Floats
 from ident.effects.words import Values, quantity, spoken
 
@@ -309,7 +309,7 @@ class Effect(ABC):
     remembers: ClassVar[bool] = True
     onsets: ClassVar[tuple[Form, ...]] = ()
     displaces: ClassVar[bool] = False
-    channel: ClassVar[Literal["motor", "joint"] | None] = None
+    channel: ClassVar[TorqueSide | None] = None
     counted: ClassVar[bool] = False
     hidden: ClassVar[tuple[str, ...]] = ()
     together: ClassVar[bool] = False

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ident.dynamics import regressor
 from ident.dynamics.kinematics import Chain
+from ident.dynamics.structure import TorqueSide
 from ident.effects.springs import Springs
 from lwr_driver.session.spool import spans
 
@@ -194,7 +195,7 @@ class ArmMotion:
         """`rigid_torque` (N, n) [Nm] of the motion itself with other `bodies` (n, 10)."""
         return regressor.torque_in(self.chain, self.frames, self.qd, self.qdd, bodies)
 
-    def smooth_torque(self, side: str) -> Floats:
+    def smooth_torque(self, side: TorqueSide) -> Floats:
         """Predicted torque (N, n) of a side without the Coulomb friction and its jumps at reversals."""
         link = self.link_coulomb * np.sign(self.qd)
         if side == "joint":

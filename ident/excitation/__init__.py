@@ -1,8 +1,8 @@
 """Planning of exciting motions: parametrisations, criteria, constraints, search, and the resulting plan.
 
 `plan("plans/default.yaml")` does everything; `lower_bound` tells how far from the best its motion may be.
-`feasible_fourier` gives a safe motion without optimisation, `random_points` the baseline, `trade_off` a front between
-two criteria, `check_motion` the verdict on any motion.
+`feasible_fourier` gives a safe motion without optimisation, `random_points` a random motion to compare with,
+`trade_off` a front between two criteria, `check_motion` the verdict on any motion.
 
 The search runs through `joblib`; its configured backend spreads it over processes or computers. On a Dask cluster, with
 `search.jobs: -1` in the problem file::

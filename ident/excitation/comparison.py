@@ -1,4 +1,4 @@
-"""Motions side by side: table, random baseline, and trade-offs between two criteria.
+"""Motions side by side: table, random motions, and trade-offs between two criteria.
 
 The table has the columns of the paper's Table 1. Fronts come from the epsilon-constraint method; the dominated volume
 measures them.
@@ -97,7 +97,7 @@ def random_points(
 ) -> PointToPoint:
     """Motion through `count` random postures and back to the first, within workspace and clearance on every line.
 
-    The baseline for optimal excitation.
+    To compare optimal excitation with.
 
     speed_scale : share of the velocity limits; a_max : acceleration limits instead of the arm's [rad/s²]
     duration_s : total time, filled by a pause in each posture; None: no pauses

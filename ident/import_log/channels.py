@@ -161,7 +161,7 @@ def _turned(
 def _left_out(
     whole: NDArray[np.bool_], values: Mapping[str, Floats], joints: tuple[str, ...], place: str, first: int
 ) -> str:
-    """What to say of the rows (n,) that are not whole. DataError if they are more than half.
+    """The sentence about rows (n,) without a value. DataError if they are more than half.
 
     values : (n, joints) or (n, 1) by what they are. first : number of the first row.
     """

@@ -17,7 +17,7 @@ from ident.import_log.rates import ALIKE, compare
 from ident.import_log.tables import Floats
 from ident.import_log.units import RATES, TURNS, close
 
-# Share of rows whose times go back, beyond which the order of the rows is in doubt.
+# Beyond this share of steps back in time the order of the rows is in doubt.
 _STEPS_BACK = 0.001
 _SHORTEST_S, _LONGEST_S = 1e-4, 0.1
 # Longest step of a rate below 10 Hz, where the velocities say so, or a joint would turn faster than this on average
@@ -129,7 +129,7 @@ class Clocks:
         return Clock(found, _seconds(column, size), column, unit, why)
 
     def _falls(self, count: int) -> list[tuple[Field, NDArray[np.int64]]]:
-        """The columns of times of `count` samples that go back, and the rows that begin so; the fewest first."""
+        """Decreasing columns of times of `count` samples with the rows of their steps back; the fewest first."""
         falls = [
             (one, np.flatnonzero(np.diff(one.values[:, 0]) < 0.0) + 1)
             for one in self._fields
@@ -147,7 +147,7 @@ class Clocks:
         return ""
 
     def _fall(self, column: Field, rows: NDArray[np.int64]) -> str:
-        """Where a column of times goes back, in `rows`, and what to do."""
+        """The steps back of a column of times, in `rows`, with the remedy."""
         times, row = column.values[:, 0], int(rows[0])
         numbers = self._numbers[len(times)]
         said = (

@@ -1,8 +1,8 @@
 """A mapping guessed from the names in a recording, the URDF, and the numbers themselves; for a person to confirm.
 
 Names give the quantities, the URDF the joints. Numbers decide units: dq/dt must be the velocity, positions of most
-joints must keep the limits of the URDF, and the mean step of the times must lie between 0.1 ms and 0.1 s, or 1 s where
-the motion says so.
+joints must keep the limits of the URDF, and the mean step of the times must lie between 0.1 ms and 0.1 s (1 s for a
+slow motion).
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ class _Guesser:
         ]
 
     def _rests(self, position: Field, joints: Sequence[str], unit: str) -> dict[str, float]:
-        """Where the recorded joints rest that are no joints of the model, noted in the table."""
+        """Positions at rest of recorded joints outside the model, noted in the table."""
         prismatic = {joint.name for joint in self.robot.joints if joint.kind == "prismatic"}
         found = rests(
             self.source,

@@ -1,4 +1,4 @@
-"""Where recorded joints rest that are no joints of the model."""
+"""Positions at rest of recorded joints outside the model."""
 
 from __future__ import annotations
 

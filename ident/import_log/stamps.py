@@ -47,8 +47,10 @@ def nanoseconds(
 
 
 def _even(times: NDArray[np.int64]) -> tuple[NDArray[np.int64], str] | None:
-    """Even times of samples whose stamps are rounded, and what to say of them: the stamps lie on a grid, and the even
-    times within a step of it. None for others, such as those with a hole."""
+    """Even times of samples with rounded stamps, and words for the note.
+
+    The stamps lie on a grid, and the even times within a step of it. None for other stamps, such as those with a hole.
+    """
     steps = np.diff(times)
     grain = int(steps[steps > 0].min())
     number = np.arange(len(times))

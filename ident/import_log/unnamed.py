@@ -1,4 +1,4 @@
-"""Columns without names told apart: by their number, and by what is the rate of what."""
+"""Columns without names, told apart by their number and by their derivatives."""
 
 from __future__ import annotations
 

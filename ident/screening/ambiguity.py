@@ -1,4 +1,4 @@
-"""Which of several explanations that fit the data alike is the likelier: of two sides, of two labels."""
+"""The likelier of explanations with the same fit: of two sides of the gear, of two payload labels."""
 
 from __future__ import annotations
 
@@ -53,9 +53,10 @@ def of_the_wrong_side(one: Explanation) -> Explanation:
 
 
 def of_the_wrong_label(one: Explanation, sessions: Sequence[Session]) -> Explanation:
-    """Of two sessions with one label that explain the data alike the wrong one, by what more the other carries.
+    """The session with the wrong label, of two with one label and the same fit.
 
-    The heavier one is no bare arm; without the load of the stated mass the lighter one is.
+    The difference of their loads decides: the heavier session is wrong where the label is the bare arm, the lighter
+    one where it is a payload of the stated mass.
     """
     if one.channel != "payload" or len(one.alike) != 1:
         return one

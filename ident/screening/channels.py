@@ -1,4 +1,4 @@
-"""What the recorded channels show by themselves, without a model: copied, stuck, contradicting, impossible."""
+"""Checks of the recorded channels without a model: copied, stuck, contradicting, impossible values."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from lwr_driver.session.spool import column
 _RATES, _LONG_S = (10.0, 20_000.0), 2.0
 # Difference of two clocks beyond jitter.
 _CLOCKS = 0.02
-# Largest distance of a jump from one turn, as a share of it, for an angle that wraps.
+# Wrapped angle: largest difference of a jump from one turn, over the turn.
 _TURN = 0.02
-# Torques of two joints that are one for a part of a session: least time [s], least share, least changes of the value:
-# columns at rest, dead or held have few.
+# Copied torques in a part of a session: least time [s], least share, least changes of the value (columns at rest, dead
+# or held have few).
 _COPIED_S, _COPIED, _CHANGES = 1.0, 0.1, 20
 
 
@@ -74,9 +74,12 @@ def _repeated(sessions: Sequence[Session]) -> Iterator[Doubt]:
 
 
 def _copied(session: Session) -> Iterator[Doubt]:
-    """Torques of several joints equal but for rounding, as two sensors never are, in every sample, or to the last bit
-    in a long part of them; or positions to the last bit in every sample. Positions of a simulation may be, if its
-    motion asks for them, or if all joints go the same way."""
+    """Channels of several joints with the same values, as two sensors never have them.
+
+    Torques: equal but for rounding in every sample, or to the last bit in a long part of the session. Positions: equal
+    to the last bit in every sample; a simulation may have such, if its motion asks for them or if all joints go the
+    same way.
+    """
     for channel, columns in torques_of(session):
         whole = _alike(columns.effort, ROUNDED)
         for joints in whole:

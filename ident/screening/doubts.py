@@ -57,14 +57,14 @@ class Doubt:
 
 
 def torques_of(session: Session) -> Iterator[tuple[str, JointColumns]]:
-    """Torque channels of a session that hold any, by the name that a doubt gives them."""
+    """Torque channels of a session with values, by their names in doubts."""
     for channel, columns in (("joint torque", session.joint), ("motor torque", session.motor)):
         if columns is not None and columns.effort.size:
             yield channel, columns
 
 
 def doubted_joints(doubts: Sequence[Doubt]) -> frozenset[str]:
-    """Joints with a doubt about their torque or position, which both make the residual of their rows."""
+    """Joints with a doubt about their torque or position; both make the residual of their rows."""
     return frozenset(
         joint
         for doubt in doubts
@@ -89,7 +89,7 @@ def settle(doubts: Sequence[Doubt]) -> list[str]:
 
 @contextlib.contextmanager
 def explaining(doubts: Sequence[Doubt]) -> Iterator[None]:
-    """Adds the doubts to a DataError from within: what they name may be its cause."""
+    """Add the doubts to a DataError from within, as its possible causes."""
     try:
         yield
     except DataError as error:

@@ -1,6 +1,6 @@
-"""Which single change of a channel makes the data of an arm agree with themselves.
+"""Explanations of contradictory data: single changes of a channel that make the data of an arm agree.
 
-Each explanation is a common mistake of people and programs: the sign of a channel, its unit or gain, two
+Each is a common mistake of people and programs: the sign of a channel, its unit or gain, two
 interchanged joints, a zero offset, the pace of time, the label of a payload, an arm on a wall. It is undone in the rows
 of `Redundancy` and judged by the fall of the score, the sum over joints and sides of log(residual / torque). The best
 one is taken, and the search goes on in the mended data, because two channels may be wrong.
@@ -38,18 +38,18 @@ AGREES = 0.1
 DOUBT, CERTAIN = float(np.log(10.0)), float(np.log(100.0))
 """Fall of the score for a doubt: the product of all residuals falls to a tenth; for certainty, to a hundredth. Wrong
 explanations of healthy recordings reach 1.6 (two joints of a real LWR4+ with torques of 0.3 Nm), true faults 5."""
-# Residual over torque of a joint, beyond which units, signs and other joints' torques are tried in parts of the data.
+# Units, signs and other joints' torques are tried in parts of the data beyond this residual over torque of a joint.
 _CONTRADICTS = 0.3
 _POSITION_GAINS = (0.5, 0.7, 0.85, 1.2, 1.4, 2.0)
 _PACES = (0.25, 0.5, 2.0 / 3.0, 0.8, 1.25, 1.5, 2.0, 4.0)
-# Fall of the score for which a plain factor is given up.
+# Least fall of the score for a measured factor in place of a plain one.
 _FINER = 0.1
 # Most corrections of a gain.
 _ROUNDS = 8
-# Relative standard deviation of bodies from those of the URDF, and logarithm of the odds that exclude a gain.
+# Relative standard deviation of bodies from the URDF's; logarithm of the odds for excluding a gain.
 _STATED, _ODDS = 0.2, float(np.log(10.0))
 _OFFSETS = (-np.pi, -0.5 * np.pi, 0.5 * np.pi)
-# Candidates that are fitted to the end, rounds in which all are compared, and for motions the rows for each parameter.
+# Candidates fitted to the end; rounds of fitting before they are compared; rows for each parameter, for motions.
 _LIKELY, _SOON, _ENOUGH = 8, 3, 6.0
 
 
@@ -76,7 +76,7 @@ class Explanation:
 
 
 def unit_of(factor: float, *, torque: bool = False) -> str:
-    """What a factor between recorded and true value looks like, of a `torque` or of a position."""
+    """The usual cause of a factor between recorded and true value, of a `torque` or of a position."""
     if factor < 0.0:
         rest = unit_of(-factor, torque=torque)
         return "a reversed sign" if abs(factor + 1.0) < 0.5 else f"a reversed sign and {rest}"
@@ -172,9 +172,9 @@ def _rivals(data: Redundancy, best: Explanation, gains: Mapping[Class, Gain]) ->
 def _likeliest(
     best: Explanation, rivals: Iterable[Explanation], before: float, normal: Normal
 ) -> Explanation:
-    """The gain that leaves bodies nearest to the URDF's, and the others that they do not exclude.
+    """The gain with bodies nearest to the URDF's, and the others not excluded by the bodies.
 
-    Torques of one joint too large and those of all that share its bodies too small fit alike.
+    A torque too large at one joint, and torques too small at all joints with the same bodies, fit alike.
     """
     others = [_measured_again(one, before, normal) for one in rivals]
     alike = [best, *(one for one in others if one is not None and one.drop > best.drop - _FINER)]
@@ -192,8 +192,10 @@ def _alike(one: Explanation, best: Explanation) -> bool:
 
 
 def _rank(numbered: tuple[int, Explanation]) -> tuple[float, bool, int]:
-    """Order of explanations: by their drop, a session before its half, all data before a part of them, and of equal
-    parts the later one, for what breaks was whole before."""
+    """Order of explanations: by their drop, a session before its half, all data before a part of them.
+
+    Of equal parts the later one comes first: a channel was whole before it broke.
+    """
     number, one = numbered
     drop = round(one.drop - _FINER * (len(one.parts) == 1), 2)
     return drop, not one.parts, number if one.parts else -number
@@ -218,7 +220,7 @@ def _torques(data: Redundancy, gains: Mapping[Class, Gain]) -> Iterator[Explanat
 
 
 def _of_parts(data: Redundancy, fit: Fit, normal: Normal) -> Iterator[Explanation]:
-    """A torque with another gain, zero, unit or joint in one session or half of it, or one that drifts."""
+    """A torque with another gain, zero, unit or joint in a session or half of one, or with a drift."""
     eye = np.eye(data.chain.n)
     doubtful = set()
     for one in part_errors(data, fit, normal):
@@ -268,7 +270,7 @@ def _likely(
     normal: Normal | None = None,
     tries: Iterable[Explanation] | None = None,
 ) -> list[Explanation]:
-    """Those with a measured size, and of the others the ones that soon leave the least residuals.
+    """The candidates with a measured size, and the others with the least residuals after a few rounds.
 
     normal : of torques, as for `Redundancy.fit`. tries : the candidates in other rows, to be tried in their place.
     """
@@ -403,8 +405,10 @@ def _labels(data: Redundancy) -> Iterator[Explanation]:
 
 
 def _measured_again(candidate: Explanation, before: float, normal: Normal) -> Explanation | None:
-    """The gain of a torque from the mended data, while it helps: the wrong channel had bent the bodies that it was
-    measured against. None where it does not settle: then the bodies fit the torque the better, the less of it there is.
+    """The gain of a torque, measured again in the mended data while it helps.
+
+    The wrong channel had bent the bodies behind the first measurement. None where the gain does not settle: the bodies
+    then fit the torque the better, the smaller it is.
     """
     moved = 1.0
     for _ in range(_ROUNDS):

@@ -25,16 +25,16 @@ ROUNDS = 8
 """Rounds of reweighting, at most."""
 BLOCK = 10
 """Rows with a common error: two seconds at the usual rate."""
-# Fall of the score in a round that ends them.
+# The rounds end with a fall of the score below this.
 _SETTLED = 1e-3
-# Square of the sine between a column and those before it, below which it is dependent.
+# Dependent column: square of the sine between it and those before it.
 _DEPENDENT = 1e-9
-# Norm of a column over the largest, below which it is nothing but rounding.
+# Column of rounding errors alone: its norm over the largest.
 _NOTHING = 1e-10
 
 
 class Blocks(NamedTuple):
-    """Symmetric matrices G (m, p, p) by their columns that are not zero.
+    """Symmetric matrices G (m, p, p) by their nonzero columns.
 
     matrix : (m, u, u), for the c <= u columns of each in the first c rows and columns. columns : (m, u), rising.
     sizes : c (m,).
@@ -89,7 +89,7 @@ class Normal:
 
     @property
     def by_data(self) -> Normal:
-        """The same without the prior, for what the data alone have to tell: a wrong URDF bends what they hardly do."""
+        """The same without the prior, from the data alone: a wrong URDF would bend weakly excited parameters."""
         width = self.mixed.shape[-1]
         return replace(self, prior=Prior(np.zeros(width), np.zeros((width, width))))
 
@@ -103,7 +103,7 @@ class Normal:
 class Fit:
     """Parameters (p,), rho and weight of each class, and weight `nominal` of the prior.
 
-    cost : what the fit minimises. `score`: sum of log rho, none below the floor.
+    cost : minimised by the fit. `score`: sum of log rho, none below the floor.
     """
 
     parameters: Floats
@@ -163,7 +163,7 @@ def solve(matrix: Floats, right: Floats) -> Floats:
 def factored(matrix: Floats) -> Callable[[Floats], Floats]:
     """The solution of the normal equations by their right side (p,) (Cholesky with pivots).
 
-    matrix : (p, p), of which the lower triangle counts.
+    matrix : (p, p); its lower triangle counts.
     """
     scale = np.sqrt(np.diag(matrix))
     scale = np.where(scale > max(_NOTHING * np.max(scale, initial=0.0), 1e-150), scale, np.inf)

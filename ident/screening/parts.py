@@ -1,8 +1,8 @@
-"""Torques that are wrong in one session, or in one half of it: a plug pulled, a driver restarted with another scale.
+"""Wrong torques in one session, or in one half of it: a plug pulled, a driver restarted with another scale.
 
-The parameters of the arm come from all sessions. What a gain, a zero or a drift of the zero of a part alone explains of
-a class's residual follows from the vectors W^T z, z^T z and z^T e of that part, with the torque z that an error by one
-adds.
+The parameters of the arm come from all sessions. An error of one part (a gain, a zero, a drift of the zero) adds to its
+torque its size times z. Its share in the residual e of a class follows from the vectors W^T z, z^T z and z^T e of that
+part.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ GAIN = 0.18
 """Least error of a gain of interest: sensors are calibrated to a few per cent."""
 LEFT = 0.75
 """Largest share of the residual left by a true error."""
-# Share of a class's squared residual that an error of one part explains, and size of a zero or a drift over the rms of
-# the torque, or over the largest of the side.
+# Least share of an error in its class's squared residual; least size of a zero or a drift over the rms of the torque,
+# and over the largest torque of the side.
 _EXPLAINED, _ZERO, _OF_LARGEST = 0.25, 0.18, 0.02
-# Share of these sizes that is enough where half of the residual goes with it: nothing else looks so.
+# A share of these sizes is enough where half of the residual goes with the error: nothing else looks so.
 _SMALL, _PLAIN = 0.45, 0.5
 _NOTHING = 1e-9
 
@@ -49,7 +49,7 @@ class PartError:
 
 
 def part_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PartError]:
-    """Gains and zeros of single sessions, and of halves of them, beyond what a calibration and chance explain."""
+    """Gains and zeros of single sessions and of halves of them, beyond calibration and chance."""
     asked = _suspects(data, fit, normal)
     if not asked:
         return []
@@ -79,7 +79,7 @@ def part_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PartError]:
 def _suspects(
     data: Redundancy, fit: Fit, normal: Normal
 ) -> dict[tuple[Class, tuple[Part, ...], ErrorKind], float]:
-    """Errors of a part that explain much of the residual of their class, and the size of interest."""
+    """Errors of a part with much of the residual of their class, and of a size of interest."""
     found = {}
     place = {part: k for k, part in enumerate(normal.parts)}
     classes = {key: k for k, key in enumerate(normal.classes)}
@@ -127,7 +127,7 @@ def _suspects(
 
 
 def _added(rows: SampledRows, computed: Floats) -> Floats:
-    """Torques (3, K) that an error by one of each kind adds to the computed torque (K,)."""
+    """Torques (3, K) of an error of size one of each kind, beside the computed torque (K,)."""
     return np.array([computed, np.ones(len(computed)), rows.time])
 
 

@@ -1,5 +1,8 @@
-"""The laws of motion as a check of sessions: inertia is positive, friction dissipates, and gravity is that of the URDF
-but for its order of magnitude; joint torque sensors feel no drive."""
+"""The laws of motion as a check of sessions.
+
+Inertia is positive, friction dissipates, joint torque sensors feel no drive, and gravity has the order of magnitude of
+the URDF's.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from ident.screening.explanations import AGREES, DOUBT, unit_of
 from ident.screening.normal_equations import DEVIATIONS, FLOOR, Fit, Normal
 from ident.screening.redundancy import Redundancy
 
-# Poses of a session that stand for all.
+# Poses of a session, in place of all samples.
 _POSES = 64
 # Factor between an arm's gravity and its URDF's: 0.9 to 1.4 in six real arms. Correlation of gravity of the two, and
 # number of joints, to speak of a factor.
@@ -58,9 +61,11 @@ def physics(data: Redundancy, normal: Normal) -> list[Doubt]:
 def _reversed(
     data: Redundancy, fit: Fit, normal: Normal, negative: NDArray[np.int64], inertia: Floats, std: Floats
 ) -> Iterator[Doubt]:
-    """Single joints with a negative inertia: their torques and those of the others have nothing in common that would
-    tell their sign. Certain where friction drives them, too. A torque that bodies and friction hardly explain, such as
-    that of a light wrist with a cable, says nothing."""
+    """Single joints with a negative inertia and nothing in common with the other joints, so with an unknown sign.
+
+    Certain where friction drives the joint, too. No doubt about a torque hardly explained by bodies and friction, such
+    as that of a light wrist with a cable.
+    """
     for joint in negative.tolist():
         if max(rho for (_, own), rho in fit.rho.items() if own == joint) > AGREES:
             continue
@@ -81,9 +86,9 @@ def _reversed(
 
 
 def drives_in_sensors(data: Redundancy) -> list[Doubt]:
-    """Drive inertia in joint torques that have no motor torques beside them.
+    """Drive inertia in joint torques without motor torques beside them.
 
-    Sensors behind the gears have none. The inertia of the first two drives is not told from that of the links.
+    Sensors behind the gears feel none. At the first two joints drive and links have one common inertia.
     """
     silent = frozenset(("motor", joint) for _, joint in data.silent)
     joints = [joint for joint in range(2, data.chain.n) if ("motor", joint) not in silent]
@@ -158,7 +163,7 @@ def _without_inertia(data: Redundancy) -> Fit:
 
 
 def friction_power(data: Redundancy, joint: int, sides: Sequence[str]) -> Floats:
-    """Row (p,) of the mean power [W] of a joint's friction, that of the links and of the drives for their sides."""
+    """Row (p,) of the mean power [W] of a joint's friction, on the link side and the motor side."""
     row = np.zeros(data.width)
     for side, viscous, coulomb in (("joint", "Fvl", "Fcl"), ("motor", "Fvm", "Fcm")):
         parts = [part for part in data.rows if part.side == side] if side in sides else []
@@ -201,7 +206,7 @@ def gravity_slopes(data: Redundancy, fit: Fit) -> dict[int, float]:
 
 
 def inertia_of(data: Redundancy, fit: Fit) -> Floats:
-    """Inertia (n,) that acts on each joint by the fit's bodies, mean over the poses [kg m^2 or kg]."""
+    """Inertia (n,) of the fit's bodies about each joint, mean over the poses [kg m^2 or kg]."""
     return _inertia_rows(data.chain, poses(data)) @ bodies_of(data, fit)
 
 

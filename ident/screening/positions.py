@@ -1,8 +1,8 @@
-"""Positions that are slightly wrong: a zero a few degrees off, a gain of some per cent, a channel late by some samples.
+"""Slightly wrong positions: a zero a few degrees off, a gain of some per cent, a channel late by some samples.
 
-The search of `explanations` has the large errors. A small one is estimated: what a change of one joint's position adds
-to the torques of the present bodies is a column beside all parameters of `Redundancy`. The joint's own parameters take
-most of it, so it shows only where other joints turn, too.
+The search of `explanations` has the large errors. A small one is estimated: a change of one joint's position changes
+the torques of the present bodies, and this change is a column beside all parameters of `Redundancy`. The joint's own
+parameters take most of it, so it shows only where other joints turn, too.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class _Kind(NamedTuple):
     """A kind of error: least size of interest, largest of a small one, least fall of the score with it undone, and the
     size in words.
 
-    Without a known error, offsets beyond 3 degrees reach a fall of 0.1 on five real arms and forty simulated ones,
-    gains beyond 10 % one of 0.8 and delays beyond 10 ms one of 0.2, and of 0.43 in a short recording of one real arm,
-    where torques are small.
+    Five real arms and forty simulated ones without a known error reach these falls: 0.1 for offsets beyond 3 degrees,
+    0.8 for gains beyond 10 %, 0.2 for delays beyond 10 ms. A short recording of one real arm with small torques
+    reaches 0.43 for a delay.
     """
 
     least: float
@@ -79,7 +79,7 @@ class PositionError:
 
 
 def position_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[PositionError]:
-    """The error that explains most, if there is one that explains enough, and more than a base that leans."""
+    """The strongest error, if it is strong enough and stronger than a leaning base."""
     asked: list[_Asked] = [
         (joint, kind, ())
         for joint in range(data.chain.n)
@@ -92,7 +92,7 @@ def position_errors(data: Redundancy, fit: Fit, normal: Normal) -> list[Position
 
 
 def session_offsets(data: Redundancy, fit: Fit, normal: Normal) -> list[PositionError]:
-    """Zeros of positions that differ in one of several sessions."""
+    """Zeros of positions different in one of several sessions."""
     return list(_errors(data, fit, normal, _by_session(data, normal)))
 
 
@@ -107,7 +107,7 @@ def _errors(data: Redundancy, fit: Fit, normal: Normal, asked: Sequence[_Asked])
     torques = [data.rigid(rows, fit) for rows in data.rows]
 
     def added(joint: int, kind: str, parts: tuple[Part, ...]) -> list[Floats]:
-        """Torques (n, K) that an error by one adds to those of the bodies, for all sets of rows."""
+        """Change (n, K) of the bodies' torques by an error of size one, for all sets of rows."""
         found = [
             (data.rigid(after, fit) - torque) / _STEP if after is not before else np.zeros_like(torque)
             for before, after, torque in zip(

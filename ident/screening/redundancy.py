@@ -1,4 +1,4 @@
-"""What the torques of an arm say about each other: one rigid model for all joints, sides and sessions.
+"""Redundancy of an arm's torques: one rigid model for all joints, sides and sessions.
 
 The joints of an arm share their inertial parameters, motor and joint torque of a joint differ by its drive alone,
 and gravity and acceleration act on the same masses. So the data hold more equations than a model needs, and a wrong
@@ -53,11 +53,11 @@ from lwr_driver.session import Session
 _BODY = len(INERTIAL)
 # Friction of the joint side; drive inertia, friction and offset of the motor side.
 _JOINT, _MOTOR = 3, 4
-# Relative standard deviation of bodies that are the URDF's in the order of magnitude.
+# Relative standard deviation of bodies from the URDF's, for their order of magnitude alone.
 _ORDER = 2.0
 _MOST_ROWS = 800
 _COVERED = 0.9
-# Share of rest in a row of a joint at rest, and of its moving rows, below which the others count, too.
+# A joint rests in a row beyond this share of rest; with a smaller share of moving rows its rows at rest count, too.
 _RESTING, _HARDLY = 0.5, 0.1
 
 
@@ -440,15 +440,15 @@ class Redundancy:
         }
 
     def shared(self, fit: Fit) -> Floats:
-        """Parameters (p,) of a fit that the joints share, zero for the others."""
+        """Parameters (p,) of a fit common to several joints, zero for the others."""
         last = _BODY * (self.chain.n + len(self.payloads))
         return np.where(np.arange(len(fit.parameters)) < last, fit.parameters, 0.0)
 
     def along(self, fit: Fit, normal: Normal, errors: Iterable[Sequence[Floats]]) -> Iterator[Size]:
         """Size of each error beside all parameters, with its standard deviation by blocks of rows.
 
-        errors : of each the columns (n, K) for all sets of rows, what an error by one adds to the computed torques
-            [Nm]. Their projection on the parameters is taken off. The prior's deviations are in that of the size.
+        errors : of each the columns (n, K) for all sets of rows, the change of the computed torques [Nm] by an error
+            of size one. Their projection on the parameters is taken off. The deviation of a size includes the prior's.
         """
         solution = factored(normal.total(fit))
         table = []

@@ -2,9 +2,9 @@
 
 First the channels by themselves (`channels`), then the arm's own redundancy (`redundancy`, `explanations`): the joints
 share their inertial parameters, motor and joint torque differ by a drive, gravity and acceleration act on the same
-masses. Of what explains the data alike the likelier is taken (`ambiguity`). The laws of motion come last (`physics`):
-positive inertia, dissipative friction. The inertia of the URDF decides only in orders of magnitude, and which of two
-gains is likelier that fit alike.
+masses. Of explanations with the same fit the likelier is taken (`ambiguity`). The laws of motion come last (`physics`):
+positive inertia, dissipative friction. The inertia of the URDF decides only in orders of magnitude, and between gains
+with the same fit.
 
 The thresholds lie between the scores of true faults and of wrong explanations of healthy data;
 `python -m benchmarks.wrong_channels` holds them against both.
@@ -46,7 +46,7 @@ logger = logging.getLogger(__name__)
 _GAIN = float(np.log(1.5))
 # A payload acts on all joints: the geometric mean of the residuals falls to a half.
 _LABEL = float(np.log(2.0))
-# Rows for each parameter, below which a fit explains anything.
+# Least rows for each parameter: with fewer a fit explains anything.
 _ROWS = 3.0
 # Pass bands tried, over that of the settings: rows see the motion low-passed, and fast motion contradicts itself in a
 # narrow band. Fall of the score for which a wider one is taken.
@@ -175,7 +175,7 @@ def _silent(sessions: Sequence[Session]) -> frozenset[Class]:
 
 
 def _contradictions(data: Redundancy, sessions: Sequence[Session]) -> tuple[list[Doubt], float, bool]:
-    """Doubts, the score that is left with the explanations undone, and whether all joints agree as recorded."""
+    """Doubts, the remaining score with the explanations undone, and whether all joints agree as recorded."""
     normal = data.normal()
     fit = data.fit(normal)
     agree = max(fit.rho.values()) <= AGREES
@@ -213,7 +213,7 @@ def _positions(data: Redundancy, fit: Fit, normal: Normal, sessions: Sequence[Se
 
 
 def _zeros(data: Redundancy, fit: Fit, normal: Normal) -> list[Doubt]:
-    """A zero that the URDF's gravity tells alone; a base that leans looks like one."""
+    """A wrong zero by the URDF's gravity alone; a leaning base looks like one."""
     try:
         nominal = data.chain.urdf_inertials()
     except LwrError:

@@ -15,13 +15,13 @@ from lwr_driver.session import JointColumns, Session
 
 # Difference of dq/dt and velocity beyond filters and jitter; beyond the second one is a wrong unit.
 _SPEEDS, _UNIT = 0.15, 1.5
-# Least difference of dq/dt and velocity that is the same in all joints, and largest spread of the joints over it: real
-# velocities, filtered by their drives, differ by 0.8 % and less.
+# Common difference of dq/dt and velocity of all joints: its least value, and the largest spread of the joints over it.
+# Real velocities, filtered by their drives, differ by 0.8 % and less.
 _COMMON, _SPREAD = 0.03, 0.25
 # Blocks of the comparison: least samples, least time [s].
 _BLOCK, _BLOCK_S = 5, 0.05
 _CORRELATED = 0.9
-# Standard deviations of a delay of positions against velocities, beyond which it is told.
+# Least delay of positions against velocities worth a doubt, in its standard deviations.
 _SURE = 5.0
 # Velocities over rad/s in other units.
 _SPEED_UNITS = {180.0 / np.pi: "deg/s for rad/s", 30.0 / np.pi: "revolutions per minute for rad/s"}
@@ -117,7 +117,7 @@ def _speeds(joint: JointColumns) -> tuple[Floats, Floats, Floats] | None:
     ) / size
     slope = np.diff(joint.position[places], axis=0) / np.diff(time[places])[:, None]
     change = np.gradient(inner, 0.5 * (time[ends] + time[places[:-1]]), axis=0)
-    # A position that jumps, or a wrong sample, says nothing of the speed.
+    # A jump or a wrong sample says nothing of the speed.
     behind = np.array([jump.behind for jump in position_jumps(joint)], dtype=np.int64)
     whole = np.diff(np.searchsorted(behind, places, side="right")) == 0
     wrong = np.count_nonzero(spikes(joint.position)[places], axis=1)

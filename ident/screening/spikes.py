@@ -1,4 +1,4 @@
-"""Single samples far from their neighbours, which are left out of the rows: misread or misprinted values."""
+"""Single samples far from their neighbours, left out of the rows: misread or misprinted values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What explains a contradiction between the channels of sessions, said as a doubt with what to check."""
+"""The words of a doubt: an explanation of contradictory channels, and the check that it asks for."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FACTOR, _LEFT = 2.0, 0.6
 
 
 def doubt_of(one: Explanation, sessions: Sequence[Session]) -> Doubt:
-    """What an explanation says of which channel, and what to check."""
+    """The doubt of an explanation: channel, observation, likely cause, remedy."""
     names = sessions[0].joint_names
     joints = tuple(names[joint] for joint in one.joints)
     channel, session, looks_like = one.channel, "", one.looks_like
@@ -87,7 +87,7 @@ def _kind(one: Explanation) -> DoubtKind:
 
 
 def _of_part(one: Explanation, sessions: Sequence[Session]) -> tuple[str, str, bool]:
-    """Session with its half, what was seen, and whether the data are worthless with it, for an error of some parts."""
+    """For an error of some parts: session with its half, observation, and whether the data are worthless with it."""
     record, half = one.parts[0]
     session = sessions[record].path.name
     if len(one.parts) == 1:
@@ -129,5 +129,5 @@ def _is_either(parts: Sequence[Part], sessions: Sequence[Session]) -> bool:
 
 
 def opposite(parts: Sequence[Part], sessions: Sequence[Session]) -> str:
-    """What may have happened instead where the parts are one of two sessions; "" otherwise."""
+    """The other reading of an error in one of two sessions; "" for other parts."""
     return ", or the opposite one in the other session" if _is_either(parts, sessions) else ""

@@ -10,7 +10,7 @@ from ident.screening.doubts import Doubt
 
 
 def check_unmeasured(chain: Chain) -> Iterator[Doubt]:
-    """A doubt about joints that the chain holds at zero because nobody said where they rest."""
+    """A doubt about joints at zero in the chain for lack of a stated position."""
     names = unmeasured(chain)
     if not names:
         return
@@ -27,8 +27,10 @@ def check_unmeasured(chain: Chain) -> Iterator[Doubt]:
 
 
 def unmeasured(chain: Chain) -> tuple[str, ...]:
-    """Names of the movable joints of the URDF behind the first and before the last joint of the chain, others than
-    the chain's own and those that follow another one (mimic)."""
+    """Movable joints of the URDF between the first and the last joint of the chain that are not in it.
+
+    Joints coupled to another one (mimic) are left out.
+    """
     if chain.urdf is None:
         return ()
     way = read_urdf(chain.urdf).chain(joints=chain.joint_names)

@@ -1,8 +1,8 @@
-"""A zero of a position that the data alone do not tell: that of the elbow of parallel axes turns the bodies behind it,
-and nothing contradicts it but the URDF.
+"""Wrong zeros of positions that only the URDF contradicts.
 
-Identified gravity is compared with that of the URDF's bodies, each joint's times a factor, as masses are seldom right.
-With the zero of one joint undone the two agree, where the URDF is roughly right.
+A wrong zero of an elbow between parallel axes turns the bodies behind it; the data remain consistent. So identified
+gravity is compared with that of the URDF's bodies, times a factor for each joint, as stated masses are seldom right.
+With the wrong zero undone the two agree, if the URDF is roughly right.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LEAST, _MOST = float(np.radians(5.0)), 0.5
 _LEFT, _RIGHT = 0.45, 0.1
 # Least power of gravity in a joint over the largest.
 _BEARING = 1e-4
-# Distance of an angle from the end of the range that is none [rad]; the search is a hundred times finer.
+# An angle so close to the end of the range is no minimum [rad]; the search is a hundred times finer.
 _STEP = 1e-3
 
 
@@ -37,7 +37,7 @@ class GravityZero(NamedTuple):
 
 
 def zero_by_gravity(chain: Chain, q: Floats, bodies: Floats, nominal: Floats) -> GravityZero | None:
-    """The zero of a joint that brings identified gravity to the URDF's, None without a clear one.
+    """The wrong zero between identified gravity and the URDF's, None without a clear one.
 
     q : (N, n) poses. bodies : (10 n,) identified, nominal : of the URDF.
     """
@@ -53,7 +53,7 @@ def zero_by_gravity(chain: Chain, q: Floats, bodies: Floats, nominal: Floats) ->
         return None
 
     def left(joint: int, angle: float) -> float:
-        """Share (rms) of gravity that the URDF's, times a factor for each joint, leaves with the joint turned."""
+        """Share (rms) of gravity left by the URDF's, times a factor for each joint, with the joint turned."""
         pose = q.copy()
         pose[:, joint] += angle
         own = torque(chain, pose, still, still, nominal)[:, bearing]

@@ -138,11 +138,11 @@ def compare_command(first: Path, second: Path, as_json: bool, level: float, repo
     result = compare(*models, level=level, labels=labels)
     page = None
     if report is not None:
-        from runner.report.comparison import Side, comparison_html
+        from runner.report.comparison import ComparedModel, comparison_html
         from runner.report.page import write_page
 
-        sides = Side.both((first, second), (models[0], models[1]))
-        page = write_page(comparison_html(result, models[0].structure.chain.joint_names, sides), report)
+        pair = ComparedModel.both((first, second), (models[0], models[1]))
+        page = write_page(comparison_html(result, models[0].structure.chain.joint_names, pair), report)
     if as_json:
         click.echo(to_json(result.to_dict()))
     else:

@@ -1,4 +1,4 @@
-"""What changed in an arm over its days, and which arms are unlike the others."""
+"""Changes of an arm over its days, and arms unlike the others."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ _WITHIN = 1.96
 
 
 @dataclass(frozen=True)
-class Side:
+class ComparedModel:
     """One of the two models. place : model file, or a folder of results with one. name : short, on the page."""
 
     place: Path
@@ -38,8 +38,10 @@ class Side:
     name: str
 
     @classmethod
-    def both(cls, places: tuple[Path, Path], models: tuple[DynamicModel, DynamicModel]) -> tuple[Side, Side]:
-        """The sides with names to tell them apart: of the arms, else the ends of their paths."""
+    def both(
+        cls, places: tuple[Path, Path], models: tuple[DynamicModel, DynamicModel]
+    ) -> tuple[ComparedModel, ComparedModel]:
+        """Both with names to tell them apart: of the arms, else the ends of their paths."""
         robots = models[0].robot, models[1].robot
         names = robots if all(robots) and robots[0] != robots[1] else short_names(*places)
         return cls(places[0], models[0], names[0]), cls(places[1], models[1], names[1])
@@ -63,10 +65,12 @@ def short_names(first: Path, second: Path) -> tuple[str, str]:
     return parts[0][-1], f"{parts[1][-1]} again"
 
 
-def comparison_html(comparison: Comparison, joints: Sequence[str], sides: tuple[Side, Side]) -> str:
+def comparison_html(
+    comparison: Comparison, joints: Sequence[str], pair: tuple[ComparedModel, ComparedModel]
+) -> str:
     """The text of the page.
 
-    joints : their names. sides : the two models; the torque errors are of those in a folder of results.
+    joints : their names. pair : the two models; the torque errors are of those in a folder of results.
     """
     changed = [one for one in comparison.differences if one.name in comparison.significant]
     level, sentence = _verdict(comparison, changed)
@@ -79,9 +83,9 @@ def comparison_html(comparison: Comparison, joints: Sequence[str], sides: tuple[
         lines.append(
             Verdict("all together", found, "p above 0.05", "good" if comparison.p > 0.05 else "look")
         )
-    first, second = sides
-    content = section("differences", "Differences", _figure(comparison, joints), _table(comparison, sides))
-    runs = [side for side in sides if (side.place / SUMMARY).is_file()]
+    first, second = pair
+    content = section("differences", "Differences", _figure(comparison, joints), _table(comparison, pair))
+    runs = [one for one in pair if (one.place / SUMMARY).is_file()]
     if runs:
         content += section("errors", "Torque errors of the runs", *_errors(runs))
     only = [
@@ -91,7 +95,7 @@ def comparison_html(comparison: Comparison, joints: Sequence[str], sides: tuple[
     ]
     if only:
         content += section("only", "Only in one", *only)
-    content += section("provenance", "Provenance", _provenance(sides))
+    content += section("provenance", "Provenance", _provenance(pair))
     return page_html(
         "Comparison",
         escape(f"{first.name} and {second.name}"),
@@ -124,12 +128,12 @@ def _words(one: Difference) -> str:
     return f"{one.first:.4g} to {one.second:.4g} {one.unit}{size}, {abs(one.z):.1f} standard deviations"
 
 
-def _table(comparison: Comparison, sides: tuple[Side, Side]) -> str:
+def _table(comparison: Comparison, pair: tuple[ComparedModel, ComparedModel]) -> str:
     head = (
         "parameter",
-        sides[0].name,
+        pair[0].name,
         "±",
-        sides[1].name,
+        pair[1].name,
         "±",
         "unit",
         "difference [%]",
@@ -187,32 +191,30 @@ def _figure(comparison: Comparison, names: Sequence[str]) -> str:
     return figure_html(Figure("differences", "Differences in standard deviations", tuple(panels)), tall=True)
 
 
-def _errors(runs: Sequence[Side]) -> list[str]:
+def _errors(runs: Sequence[ComparedModel]) -> list[str]:
     """Torque errors on held-out sessions, of each run with results."""
     rows: list[list[Cell]] = []
-    for side in runs:
-        summary = ResultFolder.load(side.place).summary
+    for run in runs:
+        summary = ResultFolder.load(run.place).summary
         for one in summary.get("validation") or []:
             error = one.get("torque_error") or {}
             shares = [error.get(side) for side in ("motor", "joint")]
             # Shares of the torque's root mean square.
             cells = [Number(None if share is None else 100.0 * share, ".2f") for share in shares]
-            rows.append([side.name, str(one.get("session", "")), *cells])
+            rows.append([run.name, str(one.get("session", "")), *cells])
     if not rows:
         return [paragraph("Neither run has a held-out session.")]
     head = ("run", "held-out session", "motor [%]", "joint [%]")
     return [table(head, rows, "Torque error of all samples on held-out sessions")]
 
 
-def _provenance(sides: Sequence[Side]) -> str:
+def _provenance(pair: Sequence[ComparedModel]) -> str:
     """Where each model comes from."""
     rows: list[list[Cell]] = []
-    for side in sides:
-        known = side.model.provenance
+    for one in pair:
+        known = one.model.provenance
         made = [str(known.get(key, "")) for key in ("estimator", "software")]
-        logs = [one.get("file", "") if isinstance(one, dict) else one for one in known.get("sessions") or ()]
-        rows.append(
-            [side.name, os.path.abspath(side.file), side.model.robot, *made, ", ".join(map(str, logs))]
-        )
+        logs = [log.get("file", "") if isinstance(log, dict) else log for log in known.get("sessions") or ()]
+        rows.append([one.name, os.path.abspath(one.file), one.model.robot, *made, ", ".join(map(str, logs))])
     head = ("model", "file", "arm", "estimator", "software", "sessions")
     return table(head, rows, "The two models", classes="paths")

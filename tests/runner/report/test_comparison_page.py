@@ -15,7 +15,7 @@ from playwright.sync_api import Browser
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import write_model
 from runner.cli import main
-from runner.report.comparison import Side, short_names
+from runner.report.comparison import ComparedModel, short_names
 from tests.ident.known_arm import estimated, truth_model  # noqa: F401  fixtures
 from tests.runner.report.view_rig import NARROW, WIDE, flaws, opened
 
@@ -68,8 +68,8 @@ def test_the_ends_of_two_paths_tell_them_apart(first: str, second: str, names: t
 
 def test_two_arms_have_their_own_names(estimated: Callable[..., DynamicModel]) -> None:  # noqa: F811
     models = (replace(estimated(1), robot="LWR4+ 812"), replace(estimated(1), robot="LWR4+ 817"))
-    sides = Side.both((Path("a.yaml"), Path("b.yaml")), models)
-    assert [side.name for side in sides] == ["LWR4+ 812", "LWR4+ 817"]
+    pair = ComparedModel.both((Path("a.yaml"), Path("b.yaml")), models)
+    assert [one.name for one in pair] == ["LWR4+ 812", "LWR4+ 817"]
 
 
 @pytest.mark.slow
