@@ -32,7 +32,13 @@ from cosmic_ray.operators.zero_iteration_for_loop import ZeroIterationForLoop
 #: The modules under trial, by stratum of the sample: files, or folders with all their files.
 STRATA: Mapping[str, tuple[str, ...]] = {
     "fri": ("fri",),
-    "lwr_driver": ("lwr_driver/guard.py", "lwr_driver/loop.py"),
+    "lwr_driver": (
+        "lwr_driver/guard.py",
+        "lwr_driver/loop.py",
+        "lwr_driver/cycle_rows.py",
+        "lwr_driver/means.py",
+        "lwr_driver/setpoint.py",
+    ),
     "ident/dynamics": ("ident/dynamics",),
     "ident/rows": ("ident/rows",),
     "ident/estimators": ("ident/estimators",),

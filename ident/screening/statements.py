@@ -18,31 +18,14 @@ _FACTOR, _LEFT = 2.0, 0.6
 
 def doubt_of(one: Explanation, sessions: Sequence[Session]) -> Doubt:
     """The doubt of an explanation: channel, observation, likely cause, remedy."""
-    names = sessions[0].joint_names
-    joints = tuple(names[joint] for joint in one.joints)
-    channel, session, looks_like = one.channel, "", one.looks_like
-    certain = one.drop > CERTAIN
-    fall = better(one.drop)
     if one.gain is not None:
-        seen = f"is {one.factor:.4g} times the torque computed from all other channels"
-        if len(joints) == 1:
-            seen = f"is {one.gain.value:.4g} ± {one.gain.std:.2g} times the torque computed from all other channels"
-        if one.alike:
-            either = {names[each.joints[0]]: each.factor for each in (one, *one.alike)}
-            listed = " or ".join(f"{joint} is {factor:.4g} times" for joint, factor in either.items())
-            joints, looks_like = tuple(either), "a gain of one of them"
-            seen = (
-                f"{listed} the torque computed from all other channels; both fit alike, the first is likelier"
-            )
-        strange = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
-        certain = strange and one.gain.left < _LEFT
-        check = (
-            "the sign of this channel and of the joint's position"
-            if one.factor < 0.0 and len(one.mended.sides) == 1
-            else "sign, unit and gain of this channel"
-        )
-        mend = f"check {check}; `scale` in the mapping of the import mends a known factor"
-    elif one.parts and channel == "position":
+        return _of_gain(one, sessions)
+    if one.channel == "payload" and one.alike:
+        return _of_labels(one, sessions)
+    joints = tuple(sessions[0].joint_names[joint] for joint in one.joints)
+    channel, session, looks_like = one.channel, "", one.looks_like
+    certain, fall = one.drop > CERTAIN, better(one.drop)
+    if one.parts and channel == "position":
         session = sessions[one.parts[0][0]].path.name
         seen = f"contradicts the torques and the other sessions; {fall}"
         looks_like += opposite(one.parts, sessions)
@@ -52,13 +35,6 @@ def doubt_of(one: Explanation, sessions: Sequence[Session]) -> Doubt:
         mend = "check this channel there; the mapping of its import mends a known factor (`scale`) or order of columns"
         if one.error is not None and one.error.kind == "drift":
             mend = "leave the session out, or record it with warm electronics"
-    elif channel == "payload" and one.alike:
-        files = [sessions[int(each.label)].path.name for each in (one, *one.alike)]
-        stated = payload_name(sessions[int(one.label)]) or "none"
-        seen = f"one of {', '.join(sorted(files))} carries another payload than its label {stated!r} says; {fall}"
-        options = " or ".join(f"`--payload {file}=NAME`" for file in sorted(files))
-        mend = f"name what is mounted in the one with the wrong label ({options}; `none`: the bare arm)"
-        return Doubt(channel, joints, seen, "", mend, certain)
     elif channel == "payload":
         session = sessions[int(one.label)].path.name
         stated = payload_name(sessions[int(one.label)]) or "none"
@@ -77,6 +53,42 @@ def doubt_of(one: Explanation, sessions: Sequence[Session]) -> Doubt:
         seen = f"contradicts the other channels; {fall}"
         mend = "check sign, unit and gain of this channel; `scale` in the mapping of the import mends a known factor"
     return Doubt(channel, joints, seen, looks_like, mend, certain, session, kind=_kind(one))
+
+
+def _of_gain(one: Explanation, sessions: Sequence[Session]) -> Doubt:
+    """The doubt about a torque with another gain, or about the torques of several joints that explain it alike."""
+    assert one.gain is not None
+    names = sessions[0].joint_names
+    joints, looks_like = tuple(names[joint] for joint in one.joints), one.looks_like
+    rest = "the torque computed from all other channels"
+    seen = f"is {one.factor:.4g} times {rest}"
+    if len(joints) == 1:
+        seen = f"is {one.gain.value:.4g} ± {one.gain.std:.2g} times {rest}"
+    if one.alike:
+        either = {names[each.joints[0]]: each.factor for each in (one, *one.alike)}
+        listed = " or ".join(f"{joint} is {factor:.4g} times" for joint, factor in either.items())
+        joints, looks_like = tuple(either), "a gain of one of them"
+        seen = f"{listed} {rest}; both fit alike, the first is likelier"
+    strange = one.factor < 0.0 or abs(np.log(one.factor)) > np.log(_FACTOR)
+    check = (
+        "the sign of this channel and of the joint's position"
+        if one.factor < 0.0 and len(one.mended.sides) == 1
+        else "sign, unit and gain of this channel"
+    )
+    mend = f"check {check}; `scale` in the mapping of the import mends a known factor"
+    certain = strange and one.gain.left < _LEFT
+    return Doubt(one.channel, joints, seen, looks_like, mend, certain, kind=_kind(one))
+
+
+def _of_labels(one: Explanation, sessions: Sequence[Session]) -> Doubt:
+    """The doubt about one of several sessions with the same label of their payload."""
+    files = sorted(sessions[int(each.label)].path.name for each in (one, *one.alike))
+    stated = payload_name(sessions[int(one.label)]) or "none"
+    seen = f"one of {', '.join(files)} carries another payload than its label {stated!r} says; {better(one.drop)}"
+    options = " or ".join(f"`--payload {file}=NAME`" for file in files)
+    mend = f"name what is mounted in the one with the wrong label ({options}; `none`: the bare arm)"
+    joints = tuple(sessions[0].joint_names[joint] for joint in one.joints)
+    return Doubt(one.channel, joints, seen, "", mend, one.drop > CERTAIN)
 
 
 def _kind(one: Explanation) -> DoubtKind:
