@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # a command imports its own alone
     from ident.estimation.validate import Validation
     from ident.excitation.lower_bound import LowerBound
     from ident.excitation.plan import ExcitationPlan
-    from lwr_driver.session.session import SessionSummary
+    from lwr_driver.session.summary import SessionSummary
     from runner.preflight import Preflight
 
 _AT_ONCE = 0.1

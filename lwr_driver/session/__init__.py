@@ -25,7 +25,6 @@ __all__ = [
     "Session",
     "SessionWriter",
     "Sessions",
-    "StatusColumns",
     "as_sessions",
     "describe",
     "read_session",

@@ -32,12 +32,11 @@ from lwr_driver.session.session import (
     Missing,
     Phase,
     Session,
-    SessionSummary,
     StatusColumns,
     stamp,
-    summarise,
 )
 from lwr_driver.session.spool import Growing, release, spans
+from lwr_driver.session.summary import SessionSummary, summarise
 
 SCHEMA_VERSION = "1"
 _FIELDS = ("position", "velocity", "effort")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 from pathlib import Path
 
 import pytest
@@ -25,3 +26,12 @@ def test_no_test_module_takes_from_another() -> None:
         for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
             name = str(node.module) if isinstance(node, ast.ImportFrom) else ""
             assert not name.rpartition(".")[2].startswith("test_"), f"{module} imports {name}"
+
+
+@pytest.mark.parametrize("package", ["fri", "lwr_driver", "ident", "sim_backend", "runner"])
+def test_a_module_has_every_name_that_it_offers(package: str) -> None:
+    for path in (ROOT / package).rglob("*.py"):
+        if "__all__" in path.read_text(encoding="utf-8"):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+            module = importlib.import_module(name)
+            assert [one for one in getattr(module, "__all__", ()) if not hasattr(module, one)] == [], name

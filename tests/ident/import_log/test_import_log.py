@@ -20,7 +20,7 @@ from ident.import_log.tables import read_text
 from ident.rows.prepare import prepare
 from lwr_driver.configuration import CONFIGS
 from lwr_driver.session import read_session
-from lwr_driver.session.session import summarise
+from lwr_driver.session.summary import summarise
 from runner.cli import main
 from tests.ident.import_log.plain_logs import PLAIN, mapping, write_csv
 
