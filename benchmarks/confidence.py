@@ -30,7 +30,7 @@ from scipy.optimize import minimize
 
 import ident.diagnosis.verdict.confidence as stored
 from benchmarks.discovery.tally import read_results
-from benchmarks.mujoco_arms.judging import diagnosis_of, habitual, names, verdict_of
+from benchmarks.mujoco_arms.judging import diagnosis_of, names, of_character, verdict_of
 
 Floats = NDArray[np.float64]
 
@@ -55,8 +55,9 @@ class Said:
 
 
 def read(path: Path, *, doubted: bool = False, reference: bool = True) -> list[Said]:
-    """All findings of a campaign about what is in the catalogue, but for habits of the healthy arm; of healthy twins,
-    too.
+    """All findings of a campaign on effects of the catalogue, those of the healthy arm's character left out.
+
+    Findings on healthy twins count, too.
 
     doubted : with the names that were more likely wrong. reference : whether the arm's healthy days were given.
     """
@@ -64,7 +65,7 @@ def read(path: Path, *, doubted: bool = False, reference: bool = True) -> list[S
     for case, hidden, traits, told in _mujoco(path, reference) if path.is_dir() else _own(path):
         for finding in [*told["findings"], *(told.get("doubted", ()) if doubted else ())]:
             right = any(names(finding, one) for one in hidden)
-            if right or not habitual(finding, traits):
+            if right or not of_character(finding, traits):
                 label = f"{finding['cause']}{finding['joints']}"
                 grounds = finding.get("grounds", {})
                 said.append(Said(path.as_posix(), case, label, float(finding["confidence"]), grounds, right))

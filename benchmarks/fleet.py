@@ -1,4 +1,4 @@
-"""A simulated fleet through `lwr-run batch` and `lwr-run trend`: who is found, on which day, at which cost.
+"""A simulated fleet through `lwr-run batch` and `lwr-run trend`: arms found, their days, and the cost.
 
     python -m benchmarks.fleet --out /tmp/fleet --jobs 2
 
@@ -56,7 +56,7 @@ def _run(*arguments: str) -> tuple[str, float]:
 @click.option("--diagnose", default="changed", show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), required=True)
 def main(arms: int, days: int, jobs: int, seed: int, diagnose: str, out: Path) -> None:
-    """Make the fleet, work on it, and hold what is said against what happened."""
+    """Make the fleet, work on it, and compare the findings with the hidden changes."""
     planned = tuple(e for e in events(days) if e.arm < arms)
     fleet = Fleet(truth(), out / "logs", planned, seed)
     for arm in range(arms):

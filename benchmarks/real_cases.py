@@ -1,4 +1,4 @@
-"""What the diagnosis says of recordings of real arms that others published, and what it gains; printed by
+"""Findings and gains of the diagnosis on published recordings of real arms; printed by
 `python -m benchmarks.real_data`.
 
 The arms of `benchmarks.real_arms`, and two more. TX40: motor torques of six joints at 5 kHz (github

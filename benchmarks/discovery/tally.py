@@ -51,7 +51,7 @@ def _first(result: Result) -> bool:
 
 
 def _passing(result: Result) -> bool:
-    """Whether what is hidden is another in each session, so that no model predicts it."""
+    """Whether the hidden cause differs from session to session, unpredictable by any model."""
     return any(hidden["passing"] for hidden in result["truth"]["hidden"])
 
 
@@ -150,7 +150,7 @@ def _bin(rho: float) -> int:
 
 
 def _confusion(singles: Sequence[Result]) -> dict[str, dict[str, int]]:
-    """What the first finding says where something is hidden with rho >= 1.03."""
+    """The first finding of each case with a cause hidden at rho >= 1.03."""
     table: dict[str, Counter[str]] = defaultdict(Counter)
     for result in singles:
         if result["rho"] < BINS[0][1]:

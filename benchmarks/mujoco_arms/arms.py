@@ -90,7 +90,7 @@ class Individual:
     resolution: float = 2.0 * np.pi / 2**19
 
     def traits(self) -> dict[str, dict[int, dict[str, float]]]:
-        """What is true of the healthy arm, by cause, joint (from 1) and, where it has one, parameter."""
+        """Effects of the healthy arm by cause and joint (from 1), with the values of their parameters."""
         joints = range(self.kind.size)
         elastic = [j for j in joints if self.kind.stiffness[j] > 0.0]
         amplitude = self.stribeck * self.coulomb

@@ -61,7 +61,7 @@ def lists(finding: Finding, hidden: Mapping[str, Any]) -> bool:
     )
 
 
-def habitual(finding: Finding, traits: Mapping[str, Any]) -> bool:
+def of_character(finding: Finding, traits: Mapping[str, Any]) -> bool:
     """Whether the healthy arm has this, at these joints, and of about this size where the size is known."""
     having = traits.get(finding["cause"], {})
     joints = [str(joint) for joint in finding["joints"]]
@@ -83,7 +83,7 @@ def judge(
 
     sure : for each fault, whether the first finding names it and is sure (in a pair: any finding)
     listed : whether an unsure one has it. right : one of them, for all faults
-    false : findings of nothing hidden and of no habit of the arm. character : of a habit
+    false : findings of nothing hidden and not of the character of the arm. character : those of it
     flagged : joints of the fault at which more is reported than of the healthy twin
     exact : right, and no finding is false. efficiency : error removed over error that the fault brought
     claims : (confidence, whether right) of all findings. deviations : of parameters, in their sigmas
@@ -95,7 +95,7 @@ def judge(
     listed = [any(lists(f, h) for f in first) for h in hidden]
     right = [f for f in findings if any(names(f, h) or lists(f, h) for h in hidden)]
     rest = [f for f in findings if not any(f is r for r in right)]
-    character = [f for f in rest if habitual(f, truth["traits"])]
+    character = [f for f in rest if of_character(f, truth["traits"])]
     false = [f for f in rest if not any(f is c for c in character)]
     outside = any(not h["listed"] for h in hidden)
     verdict = {
@@ -144,7 +144,7 @@ def _places(truth: Mapping[str, Any]) -> list[int]:
 
 
 def _entries(diagnosis: Mapping[str, Any]) -> set[tuple[str, int]]:
-    """What is reported of which joint: named, unsure, nameless or unexplained."""
+    """Reports by cause and joint: named, unsure, nameless or unexplained."""
     found = {(str(f["cause"]), int(joint)) for f in diagnosis.get("findings", ()) for joint in f["joints"]}
     found |= {(str(f["cause"]), 0) for f in diagnosis.get("findings", ()) if not f["joints"]}
     for kind in ("unexplained", "nameless"):

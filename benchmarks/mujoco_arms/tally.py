@@ -84,12 +84,12 @@ def _findings(judged: Sequence[Result]) -> list[str]:
     within = [r["verdict"] for r in judged if r["truth"]["kind"] != "outside"]
     count = sum(len(v["findings"]) for v in within)
     false = Counter(f.split("(")[0] for v in within for f in v["false"])
-    habit = Counter(f.split("(")[0] for v in within for f in v["character"])
+    character = Counter(f.split("(")[0] for v in within for f in v["character"])
     removed = sorted(e for r in judged if (e := r["verdict"]["efficiency"]) is not None)
     worse = [r for r in judged if r["verdict"]["worse"]]
     return [
         f"findings: {count}; of nothing hidden {sum(false.values())} ({_counts(false)}); "
-        f"of a habit of the arm {sum(habit.values())} ({_counts(habit)})",
+        f"of the character of the arm {sum(character.values())} ({_counts(character)})",
         f"extended model worse by more than 1 % at a joint: {len(worse)} of {len(judged)} cases",
         *(
             [f"error removed of what the fault brought, median of {len(removed)}: {median(removed):.2f}"]

@@ -1,4 +1,4 @@
-"""Which tests run which lines: one run of the tests with coverage, kept by the contents of the files."""
+"""The tests of each line, from one run with coverage, kept by the contents of the files."""
 
 from __future__ import annotations
 

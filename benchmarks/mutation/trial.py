@@ -1,4 +1,4 @@
-"""Trials of mutants: a process that has imported what is slow to import, and forks for each run of tests.
+"""Trials of mutants: a process with the slow imports done, forked for each run of tests.
 
 It works in a copy of the tree, with one JSON object a line on its input and output.
 """

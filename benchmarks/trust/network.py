@@ -1,4 +1,4 @@
-"""What is bound, who is answered, and what is said when somebody else speaks."""
+"""Bound addresses, the one answered controller, and reports of other senders."""
 
 from __future__ import annotations
 

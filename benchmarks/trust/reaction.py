@@ -72,7 +72,7 @@ def measure(cause: str, seed: int, ring: Ring, folder: Path) -> dict[str, Any]:
         for _ in range(200):
             before = stand.setpoint.copy()
             row = int(stand.control.words[Word.ROW])
-            # What is still sent to a controller that no longer follows moves nothing.
+            # A controller that no longer follows ignores further commands.
             follows = stand.session.state is State.CMD and stand.silent == 0
             stand.cycle()
             now = stand.cycle_number - begun

@@ -4,7 +4,7 @@ One call of `cycle` is one FRI cycle over real sockets, with a clock of its own 
 loop, so a run takes milliseconds and repeats itself from its seed, in lock step as in real time. The arm
 follows at once; the physics of the arm has campaigns of its own.
 
-What is judged is what arrived at the controller, as float32, by the emulator's command monitor. The packets
+The emulator's command monitor judges the commands as they arrived at the controller, in float32. The packets
 carry their true number in the torque of the last joint, so that the log can be held against it.
 """
 

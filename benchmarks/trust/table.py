@@ -70,7 +70,7 @@ def _plain(value: Any) -> str:
 
 
 class Ledger:
-    """All lines, and which pieces of work are done, in one file that is written after every piece.
+    """All lines and the finished pieces of work, in one file, written after every piece.
 
     seed : of the campaign; a file of another seed is not continued
     """

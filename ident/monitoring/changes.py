@@ -1,8 +1,8 @@
 """Change points of a quantity over days.
 
 A healthy quantity scatters from day to day beyond its standard deviations: friction follows temperature, zeros of
-sensors drift. This scatter is the arm's habit. It is learned from the differences of consecutive days, so a change
-hardly enters it, and shrunk to a usual one, such as the median of other arms, while the days are few.
+sensors drift. The arm's own scatter is learned from the differences of consecutive days, so a change hardly enters it,
+and shrunk to a usual one, such as the median of other arms, while the days are few.
 
 Two courses are compared with a constant one: a step, after which the quantity is another, and a drift, from a day on
 proportional to time. The gain of the best over all days is judged by Student's t distribution with Bonferroni's

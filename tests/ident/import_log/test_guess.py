@@ -49,7 +49,7 @@ def session(guess: Guess, source: Path, folder: Path):
     return read_session(folder / "out.mcap")
 
 
-HABITS: dict[str, tuple[str, str, str, str]] = {
+NAMINGS: dict[str, tuple[str, str, str, str]] = {
     "letters": ("t", "q{k}", "dq{k}", "tau{k}"),
     "words": ("Time", "Position{k}", "Velocity{k}", "TorqueSm{k}"),
     "joint names": ("stamp", "{joint}_pos", "{joint}_vel", "{joint}_effort"),
@@ -61,9 +61,9 @@ HABITS: dict[str, tuple[str, str, str, str]] = {
 }
 
 
-@pytest.mark.parametrize("habit", HABITS)
-def test_columns_are_known_by_their_names(habit: str, arm: Path, tmp_path: Path) -> None:
-    time, q, qd, tau = HABITS[habit]
+@pytest.mark.parametrize("naming", NAMINGS)
+def test_columns_are_known_by_their_names(naming: str, arm: Path, tmp_path: Path) -> None:
+    time, q, qd, tau = NAMINGS[naming]
     aside = ["tau_J_d{k}", "target_q_{k}", "temp_{k}", "q_filtered{k}"]
     names = [time, *(name for pattern in (*aside, q, qd, tau) for name in columns(pattern))]
     path = write(tmp_path / "run.csv", names, T, TAU + 9, Q + 9, Q * 0, Q * 1.1, Q, QD, TAU)
