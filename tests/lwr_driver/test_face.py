@@ -38,14 +38,17 @@ def test_loop_process_loads_only_what_it_runs():
         "configuration",
         "contact",
         "control",
+        "cycle_rows",
         "guard",
         "loop",
         "loop_process",
+        "means",
         "pace",
         "places",
         "realtime",
         "references",
         "ring",
+        "setpoint",
         "yaml_text",
     }
 
