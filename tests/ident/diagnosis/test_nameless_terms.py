@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from fri.errors import ConfigurationError
-from ident.diagnosis import Diagnosis, diagnose
+from ident.diagnosis import Diagnosis, DiagnosisSettings, diagnose
+from ident.diagnosis.causes.probes import find_remainders
+from ident.diagnosis.outcome.signatures import signature_bench
 from ident.dynamics.kinematics import Chain
 from ident.effects import NAMELESS, check_entry
 from ident.effects.nameless import KNOTS
@@ -70,6 +72,20 @@ def test_friction_by_the_speed_of_a_neighbour_is_one_term(make: Make, chain: Cha
     found = diagnose(fitted, chain, test=[make("c.mcap", 5, stiffer, 2)])
     assert any(one.depends_on[:2] == ("qd3", "sign(qd2)") for one in found.nameless)
     assert not any(f.confidence >= 0.8 for f in found.claims)
+
+
+def test_a_large_function_is_held_against_its_own_kind_on_the_healthy_arm(make: Make, chain: Chain) -> None:
+    dictionary = signature_bench([make("a.mcap", 1, drag_by_neighbour)], chain).dictionary
+    any_kind = {("nameless_motor", 1): 1e6}
+
+    def remainders(limits: dict[str, float]) -> list[tuple[str, int]]:
+        null = any_kind | {(f"nameless_motor {kind}", 1): limit for kind, limit in limits.items()}
+        found = find_remainders(dictionary, DiagnosisSettings(), null)
+        return [(one.side, one.joint) for one in found if "qd3" in one.depends_on]
+
+    assert ("motor", 2) not in remainders({})
+    assert ("motor", 2) in remainders({"other qd": 5.0})
+    assert ("motor", 2) not in remainders({"own qd": 5.0, "other q sign(qd)": 5.0})
 
 
 def _entry(form: str) -> dict[str, object]:
