@@ -30,7 +30,7 @@ _GROUPS = {
     metavar="SESSION",
     help="Held-out session, never fitted (repeatable).",
 )
-@click.option("--model", type=PATH, help="Present model, the baseline of the simulation.")
+@click.option("--model", type=PATH, help="Present model, replayed beside the extended one.")
 @click.option("--reference", type=PATH, help="Healthy-arm baseline of `lwr-run commission`.")
 @click.option("--out", required=True, type=OUTPUT_FOLDER, help="Folder of the results.")
 @arm_options

@@ -142,7 +142,7 @@ def study(
 
     arm : description of the arm, for stiffness and gear ratios; without it the simulated joints are stiff.
     data : of its drives; default: from the description.
-    model : the present model, the baseline of the simulation. reference : model of `lwr-run commission`.
+    model : the present model, replayed beside the extended one. reference : model of `lwr-run commission`.
     compare : causes to put side by side besides those of open findings. sure : see `Study`. jobs : threads, -1 for
         one a core.
     Raises DataError for unusable sessions.
