@@ -18,6 +18,7 @@ from ident.dynamics.known_arm import known_arm
 from ident.dynamics.structure import Condition, Coulomb, Coupling, ModelStructure, Side
 from ident.dynamics.tables import Tabular
 from ident.estimation.assumptions import Assumptions, check_assumptions, weak_parameters
+from ident.estimation.channel_errors import beside_channel_errors
 from ident.estimation.essential import Essential, EssentialSettings, find_essential
 from ident.estimation.feasibility import NEAREST_REAL, Feasibility, feasibility
 from ident.estimation.plausibility import payload_warnings, require_plausible
@@ -377,6 +378,12 @@ class Observed:
         essential = None
         if settings.essential is not None and self.full_rank:
             essential = find_essential(problem, estimate, settings.essential, settings.covariance)
+        told = estimate
+        if settings.covariance.kind != "textbook":
+            told = beside_channel_errors(problem, estimate)
+            if essential is not None:
+                reduced = problem.select(essential.columns)
+                essential = replace(essential, estimate=beside_channel_errors(reduced, essential.estimate))
         warnings = [
             *settle(self.known.doubts),
             *(text for session in self.prepared for text in session.warnings),
@@ -385,7 +392,7 @@ class Observed:
         real = feasibility(base, estimate)
         if real is not None and not real.possible:
             warnings.append(f"{real}; {NEAREST_REAL}")
-        warnings += payload_warnings(self.sessions, self.payloads, base, estimate, self.structure)
+        warnings += payload_warnings(self.sessions, self.payloads, base, told, self.structure)
         warnings += [] if self.full_rank else _too_short(estimate, self.prepared)
         warnings += _excitation_warnings(problem, estimate, self.full_rank, doubted)
         return Identification(
@@ -393,7 +400,7 @@ class Observed:
             structure=self.structure,
             base=base,
             problem=problem,
-            estimate=estimate,
+            estimate=told,
             prepared=self.prepared,
             payloads=self.payloads,
             condition=problem.condition,

@@ -6,7 +6,7 @@ Tails and quantiles come from `scipy.special`, without the slow import of `scipy
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -83,9 +83,11 @@ class Estimate(Tabular):
     """Result of an estimator.
 
     values : (p,) estimates. covariance : the stated one. covariances : all computed ones by name
-        ("textbook", "hac", "bootstrap"). weights : (classes,) inverse variances. residuals : y - A chi [Nm] of
-        each row group. standard : standard parameters, if the estimator finds them. prior_scale : factor s on
-        the prior's covariance, with a prior. prior_only : names of the parameters known through the prior alone.
+        ("textbook", "hac", "bootstrap", "exact channels"). weights : (classes,) inverse variances. residuals :
+        y - A chi [Nm] of each row group. standard : standard parameters, if the estimator finds them. prior_scale :
+        factor s on the prior's covariance, with a prior. prior_only : names of the parameters known through the prior
+        alone.
+        bread : (p, p), derivative of the estimate by its scores; score_weights : (classes,) of the residuals in them.
     """
 
     method: str
@@ -103,6 +105,8 @@ class Estimate(Tabular):
     standard: Floats | None = None
     prior_scale: float | None = None
     prior_only: tuple[str, ...] = ()
+    bread: Floats = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    score_weights: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
 
     @property
     def std(self) -> Floats:

@@ -163,6 +163,8 @@ def estimate_from(
         converged=converged,
         notes=notes,
         units=problem.units,
+        bread=bread,
+        score_weights=by_class,
     )
 
 
