@@ -302,4 +302,23 @@ BUGS: tuple[Bug, ...] = (
             "test_a_late_channel_is_held_against_rows_away_from_reversals_where_these_tell_it",
         ),
     ),
+    Bug(
+        "all statements of a cycle read the motor currents at its end",
+        "sim_backend/cabinet.py",
+        "measured[number - milliseconds]",
+        "measured[-1]",
+        (
+            "tests/sim_backend/test_programs.py::test_a_statement_reads_the_motor_currents_of_its_own_millisecond",
+        ),
+    ),
+    Bug(
+        "errors of the torque channels are left out of the stated deviations",
+        "ident/estimation/channel_errors.py",
+        "stated.matrix + found.spread",
+        "stated.matrix",
+        (
+            "tests/ident/estimation/test_channel_errors.py::"
+            "test_the_deviations_hold_with_channels_off_by_a_per_cent",
+        ),
+    ),
 )
