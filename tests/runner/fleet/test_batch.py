@@ -14,15 +14,18 @@ from click.testing import CliRunner
 from playwright.sync_api import Browser
 
 from ident.diagnosis import Reference
-from ident.estimation.identify import IdentificationSettings
+from ident.estimation.channel_errors import EXACT_CHANNELS
+from ident.estimation.identify import IdentificationSettings, identify
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import read_model
 from lwr_driver.session import SessionWriter, session_metadata
 from runner.cli import main
 from runner.fleet import FleetStore, fleet_trend
-from runner.fleet.batch import Order, _identified
+from runner.fleet.batch import Order, _identified, _write_day
 from runner.fleet.days import ArmDay, find_days
+from runner.fleet.store import ArmStore
 from tests.fleet import Event, Fleet
+from tests.ident.estimation_arm import Sensors, chain, session
 from tests.ident.known_arm import truth_model  # noqa: F401  fixture
 from tests.runner.report.view_rig import CONTRAST, NARROW, WIDE, flaws, opened
 
@@ -113,6 +116,17 @@ def test_a_task_leaves_the_loggers_of_its_process_as_they_were(tmp_path: Path) -
         assert logger.level == logging.INFO
     finally:
         logger.setLevel(before)
+
+
+def test_a_day_keeps_deviations_without_the_errors_of_the_channels(tmp_path: Path) -> None:
+    settings = IdentificationSettings(model=1, essential=None)
+    found = identify([session(motor=False, sensors=Sensors(joint=0.2))], chain(), settings)
+    arm = ArmStore(tmp_path / "arm")
+    _write_day(arm, ArmDay("arm", datetime.date(2026, 3, 1), ()), found)
+    stored = {row["name"]: row["std"] for row in arm.read("parameters")}
+    exact = found.estimate.covariances[EXACT_CHANNELS].std
+    assert [stored[name] for name in found.base.names] == exact.tolist()
+    assert np.all(exact < found.estimate.std)
 
 
 def test_the_model_of_all_days_comes_from_the_factors_alone(fleet: Fleet, store: FleetStore) -> None:
