@@ -313,7 +313,8 @@ def _headline(content: Plain, details: Plain, findings: Sequence[FindingStatemen
     if max((row["avoidable_share"] for row in rows), default=0.0) < _AVOIDABLE_LOOK > beyond:
         return "good", "No model error is detectable in these data"
     if beyond < _AVOIDABLE_LOOK:
-        return "good", "No cause found, and no more error on held-out data than on the healthy days"
+        more = "hardly" if beyond > 0.0 else "no"
+        return "good", f"No cause found, and {more} more error on held-out data than on the healthy days"
     than = "that of the healthy days" if any(row.get("healthy") for row in rows) else "the noise"
     return "look", (
         f"The data support no cause, but up to {100 * beyond:.0f} % of the error's power on held-out data is above "

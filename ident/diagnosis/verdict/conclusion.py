@@ -34,7 +34,7 @@ from ident.diagnosis.verdict.models import changes_of, fitted_models, lasting, w
 from ident.diagnosis.verdict.payloads import unchecked_masses
 from ident.diagnosis.verdict.refit import BY_IDENTIFY, Entries, left_by, refitted
 from ident.diagnosis.verdict.task import Baseline, State, Task
-from ident.diagnosis.verdict.wear import is_level, wear
+from ident.diagnosis.verdict.wear import Worn, is_level, wear
 from ident.effects import EFFECTS
 from ident.model import DynamicModel
 from ident.rows.data_quality import sample_loss
@@ -56,7 +56,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
     worn = _worn(task, state, claimed)
     members, after = extension(bench, baseline, _members(nominal, claimed), nuisance, task.settings.seed)
     told = _told_models(task, state, baseline, members, after)
-    findings, doubts = _findings(task, state, told, claimed, [*state.loads, *worn], refuted)
+    findings, doubts = _findings(task, state, told, claimed, [*state.loads, *worn.findings], refuted)
     rms_base, rms_extended = told.before.rms(), told.after.rms()
     left = _left(task, evidence.floor, told, findings, claimed.remainders)
     simulation, extended_simulation = _simulated(task, told)
@@ -96,6 +96,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
             *tolerated_gains(state.selection.deviations, nominal.arm.chain.joint_names),
             *state.notes,
             *told.notes,
+            *worn.notes(),
         ),
         residuals={"base": told.before.residual, "extended": told.after.residual},
         states={side: _states(nominal, side, told.before.block[side]) for side in nominal.rows},
@@ -141,10 +142,10 @@ def _believed(task: Task, state: State, borne_out: Sequence[Confirmed]) -> _Clai
     return _Claimed([one.claim for one in kept], findings, doubts, left)
 
 
-def _worn(task: Task, state: State, claimed: _Claimed) -> list[Finding]:
-    """Findings of changed drives; none without a healthy arm."""
+def _worn(task: Task, state: State, claimed: _Claimed) -> Worn:
+    """Changed drives; none without a healthy arm."""
     if task.reference is None:
-        return []
+        return Worn()
     bench, selection = state.bench, state.selection
     shown = held_out(bench.evidence, [*claimed.rows, *selection.nuisance_rows])
     # Without the reference's prior, gains of the sensors and drive inertias compensate each other, and so do

@@ -12,7 +12,8 @@ all sessions may be worn or warmer; the same motion cold and warm decides.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,9 +28,10 @@ from ident.diagnosis.outcome.result import Finding, FindingEvidence, Value
 from ident.diagnosis.verdict.confidence import HARDLY
 from ident.effects import FRICTION_TEMPERATURE, WEAR
 from ident.effects.course import Course
-from ident.estimators.estimate import fisher_tail
+from ident.estimators.estimate import fisher_limit, fisher_tail
 
 _PARAMETERS = {"Fcm": "coulomb", "Fvm": "viscous", "Ia": "inertia"}
+_WORDS = {"inertia": "inertia", "viscous": "viscous friction", "coulomb": "Coulomb friction"}
 # Largest probability of such a change in one of the joints on a healthy arm.
 _ONE_IN = 0.01
 # Least relative change that matters to a user, of the largest parameter.
@@ -42,6 +44,25 @@ _CLEAR = 4.0
 # inertia with an unknown stiffness of the joints, whose share in it changes with the motion.
 _WORN_OR_WARM = 0.75
 _TELL_APART = "the same motion with joint {joint} cold and warm: wear stays, warmth goes"
+
+
+class Worn(NamedTuple):
+    """Findings of changed drives, and the least relative change that could be one, by parameter: the median of the
+    joints. sets : of the healthy arm."""
+
+    findings: Sequence[Finding] = ()
+    least: Mapping[str, float] = {}
+    sets: int = 0
+
+    def notes(self) -> list[str]:
+        """What a healthy arm may change by as well."""
+        if not self.least:
+            return []
+        listed = ", ".join(f"{_WORDS[label]} {100.0 * share:.2g} %" for label, share in self.least.items())
+        return [
+            f"of a drive a change shows from about {listed} on; a smaller one may be a healthy arm's, by what the days "
+            f"of {self.sets} healthy set{'s' * (self.sets > 1)} tell"
+        ]
 
 
 def is_level(claim: Claim) -> bool:
@@ -57,12 +78,12 @@ def wear(
     claimed: Sequence[Rows],
     tolerated: Sequence[Rows],
     remainders: Sequence[Remainder],
-) -> list[Finding]:
+) -> Worn:
     """Findings of changed drives beside claimed and tolerated columns. after : held-out rows with the claims."""
     nominal, evidence = bench.nominal, bench.evidence
     prior = reference.prior(nominal.base, nominal.masses, wider=1.0)
     if prior is None or not reference.sets or "motor" not in nominal.rows:
-        return []
+        return Worn()
     precision, healthy = prior
     known = np.flatnonzero(np.diag(precision) > 0.0)
     spread = np.zeros_like(precision)
@@ -79,7 +100,8 @@ def wear(
     values, covariance = alone(claimed)
     # Motor torques sampled at another phase of the commands show another inertia.
     other = ("Ia",) if nominal.arm.motor_delay_s != reference.motor_delay_s else ()
-    found = []
+    found: list[Finding] = []
+    least: dict[str, list[float]] = {}
     moving = np.flatnonzero(nominal.moving)
     for joint in moving.tolist():
         names = {
@@ -102,9 +124,12 @@ def wear(
         freedom = max(float(reference.sets * len(moving)), 2.0)
         p_value = min(1.0, len(moving) * fisher_tail(square / len(places), len(places), freedom))
         share, std = change / whole[places], np.sqrt(np.diag(own)) / whole[places]
+        labels = [names[nominal.base.names[k]] for k in places]
+        limit = np.sqrt(len(places) * fisher_limit(_ONE_IN / len(moving), len(places), freedom))
+        for label, one in zip(labels, std.tolist(), strict=True):
+            least.setdefault(label, []).append(max(float(limit) * one, _MATTERS))
         if p_value > _ONE_IN or np.max(np.abs(share)) < _MATTERS:
             continue
-        labels = [names[nominal.base.names[k]] for k in places]
         sizes = dict(zip(labels, np.abs(share / std).tolist(), strict=True))
         bends = nominal.arm.compliance
         stiff = bool(bends[joint] > 0.0 and not unsure(bends, nominal.arm.compliance_std)[joint])
@@ -134,7 +159,7 @@ def wear(
                 gain=square,
             )
         )
-    return found
+    return Worn(found, {label: float(np.median(some)) for label, some in least.items()}, reference.sets)
 
 
 def _left(

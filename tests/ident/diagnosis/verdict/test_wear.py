@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -67,8 +68,17 @@ def test_more_friction_is_wear_of_that_joint_with_its_size(
 def test_a_healthy_day_and_an_arm_without_reference_show_no_wear(
     make: Make, chain: Chain, reference: Reference
 ) -> None:
-    assert not worn(diagnose(pair(make, seed=31), chain, reference=reference))
-    assert not worn(diagnose(pair(make, friction(1.0)), chain))
+    healthy, alone = (
+        diagnose(pair(make, seed=31), chain, reference=reference),
+        diagnose(pair(make, friction(1.0)), chain),
+    )
+    assert not worn(healthy)
+    assert not worn(alone)
+    (told,) = [note for note in healthy.notes if "of a drive a change shows" in note]
+    for label in ("inertia", "viscous friction", "Coulomb friction"):
+        (percent,) = re.findall(rf"{label} ([0-9.]+) %", told)
+        assert 3.0 <= float(percent) < 60.0
+    assert not any("of a drive a change shows" in note for note in alone.notes)
 
 
 def test_a_usual_gain_of_a_sensor_is_no_wear_of_its_drive(
