@@ -191,7 +191,7 @@ coupling_option = click.option(
 gear_ratio_option = click.option(
     "--gear-ratio",
     metavar="N[,N...]",
-    help="Motor turns per turn of the joint, one for all or one per joint; default: from the arm file.",
+    help="Motor turns per joint turn, one for all or one per joint; default: from the reference or the arm file.",
 )
 
 

@@ -226,7 +226,8 @@ def find_remainders(
 ) -> tuple[Remainder, ...]:
     """Remainders beside the columns of the evidence, largest first; at most two variables each.
 
-    null : limits of their gain on the healthy arm, by name of the nameless term, and by the kind of function.
+    null : limits of their gain on the healthy arm, by name of the nameless term, and by the kind of function
+    of another joint's variable.
     """
     found = []
     evidence, variables = dictionary.evidence, hats_of(dictionary)
@@ -257,16 +258,14 @@ def _one(
 ) -> Remainder | None:
     """The remainder of a joint from its line and its `prepared` groups of columns.
 
-    limits : least gain of any, and of a large one of each name: a healthy arm with other motions has small functions
-    of kinds that its sets do not show.
+    limits : least gain of any, and of a large one of each name.
     """
     taken: list[tuple[str, Score, Rows]] = []
-    fixed, line_hz, least_gain = list(evidence.extra), 0.0, limits[_ANY]
-    beside_line = 0.0
+    fixed, line_hz, beside_line = list(evidence.extra), 0.0, 0.0
     if line is not None:
         frequency, waves, choices = line
         score = evidence.score(evidence.padded(waves))
-        least = least_gain + 2.0 * (len(score.coefficients) + np.log(choices))
+        least = limits[_ANY] + 2.0 * (len(score.coefficients) + np.log(choices))
         if score.gain > least and score.inflation > _LEAST_INFLATION:
             line_hz = frequency
             beside_line = _OF_LINE * score.gain
@@ -302,7 +301,7 @@ def _term(name: str, score: Score, rows: Rows, variables: Mapping[str, Curve]) -
 
 def remainder_gains(dictionary: Dictionary) -> dict[tuple[str, int], float]:
     """Largest gain of a function of the motion or of a line beside the columns of the evidence, by the name of the
-    nameless term and the joint from 0, and of each kind of function."""
+    nameless term and the joint from 0, and of each kind of function of another joint's variable."""
     found = {}
     evidence = dictionary.evidence
     for one in _searched(dictionary, hats_of(dictionary)):
@@ -311,22 +310,29 @@ def remainder_gains(dictionary: Dictionary) -> dict[tuple[str, int], float]:
         found[NAMELESS[one.side].cause, one.joint] = max(0.0, *(score.gain for score in scores))
         for name, score in zip(one.groups, scores, strict=False):
             kind = _kind(one.side, one.joint, name)
-            found[kind] = max(found.get(kind, 0.0), score.gain)
+            if kind is not None:
+                found[kind] = max(found.get(kind, 0.0), score.gain)
     return found
 
 
-def _kind(side: str, joint: int, name: str) -> tuple[str, int]:
-    """Kind of a function of some variables, of the joint (from 0) itself or of another one, and the joint."""
+def _kind(side: str, joint: int, name: str) -> tuple[str, int] | None:
+    """Kind of a function of another joint's variable, and the joint (from 0); None for one of the joint's own."""
     variable, _, factor = name.partition(" ")
     of = variable.rstrip("0123456789")
-    whose = "" if variable == of else "own " if variable == f"{of}{joint + 1}" else "other "
-    return f"{NAMELESS[side].cause} {whose}{of} {re.sub('[0-9]', '', factor)}".rstrip(), joint
+    if variable in (of, f"{of}{joint + 1}"):
+        return None
+    return f"{NAMELESS[side].cause} {of} {re.sub('[0-9]', '', factor)}".rstrip(), joint
 
 
 def _limit(null: Null, side: str, joint: int, name: str) -> float:
-    """Of a function on the healthy arm, by its kind; a reference of an earlier version has that of any."""
-    any_limit = null.get((NAMELESS[side].cause, joint), 0.0)
-    return any_limit if name == _ANY else null.get(_kind(side, joint, name), any_limit)
+    """Of a large function on the healthy arm; a reference of an earlier version has that of any.
+
+    Of another joint's variable a healthy arm hardly has any, and is asked for that kind alone. What it lacks in its own
+    friction, inertia and load differs with the motion, and one of them looks like another.
+    """
+    of_any = null.get((NAMELESS[side].cause, joint), 0.0)
+    kind = None if name == _ANY else _kind(side, joint, name)
+    return of_any if kind is None else null.get(kind, of_any)
 
 
 def hats_of(dictionary: Dictionary, only: str | None = None) -> dict[str, Curve]:
