@@ -107,6 +107,7 @@ def doubted(
         like = claim.trial.passing and bool(unnamed & mine)
         strange = not _familiar(claim, bench)
         open_ = like or strange or grounds.replaceable > _REPLACEABLE or _bent(claim, remainders)
+        open_ = open_ or _one_way(claim, [c.claim for c in kept])
         most = min(one.most, claim.confidence, OPEN if open_ else 1.0)
         findings.append(
             replace(one.finding, confidence=min(most, probability(grounds)), grounds=grounds.to_dict())
@@ -119,6 +120,21 @@ def _familiar(claim: Claim, bench: DiagnosisBench) -> bool:
     trial, setting = claim.trial, bench.dictionary.setting
     joint = max(trial.candidate.joint, 0)
     return trial.candidate.effect.familiar(trial.shape, claim.score.coefficients, setting, joint)
+
+
+def _one_way(claim: Claim, claims: Sequence[Claim]) -> bool:
+    """Whether a claim may be half of a stronger one of its joint and variable, one of them with the sign of the
+    direction and the other without: friction in one direction alone is the sum of both."""
+    candidate, law = claim.trial.candidate, claim.trial.candidate.effect.law
+
+    def is_other_half(one: Claim) -> bool:
+        other = one.trial.candidate
+        if other.joint != candidate.joint or other.effect.law is None or law is None:
+            return False
+        halves = other.effect.law.variable == law.variable and other.effect.law.signed != law.signed
+        return halves and bool(set(claim.trial.rows) & set(one.trial.rows))
+
+    return any(one.gain > claim.gain and is_other_half(one) for one in claims)
 
 
 def _bent(claim: Claim, remainders: Sequence[Remainder]) -> bool:

@@ -16,7 +16,7 @@ from ident.diagnosis.causes.claims import Claim
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.outcome.result import Finding, FindingEvidence, Value
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.diagnosis.verdict.confirmation import _refuted
+from ident.diagnosis.verdict.confirmation import _one_way, _refuted
 from ident.diagnosis.verdict.findings import sizeless
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS, Shape
@@ -52,6 +52,19 @@ def test_a_sure_fall_needs_no_size_and_the_larger_part_below_zero_refutes() -> N
 def test_held_out_data_refute_no_event_and_nothing_that_they_hardly_excite() -> None:
     assert not refuted(0.1, (-10.0, 10.0), cause="contact")
     assert not refuted(0.1, (-10.0, 10.0), hardly=True)
+
+
+def test_the_weaker_half_of_friction_in_one_direction_is_never_sure() -> None:
+    def claim(cause: str, gain: float, joint: int = 3) -> Claim:
+        score = Score(gain, gain, np.ones(1), 0.1, lambda: (np.eye(1), 40))
+        rows = {("motor", joint): np.ones((4, 1))}
+        return Claim(Trial(Candidate(EFFECTS[cause], joint), Shape(), score, rows), score)
+
+    friction, spring = claim("friction_position", 900.0), claim("cable_spring", 400.0)
+    assert _one_way(spring, [friction, spring])
+    assert not _one_way(friction, [friction, spring])
+    assert not _one_way(spring, [claim("friction_position", 900.0, joint=2), spring])
+    assert not _one_way(spring, [claim("gear_ripple", 900.0), spring])
 
 
 @pytest.mark.parametrize(
