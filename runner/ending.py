@@ -10,7 +10,7 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
 
-from ident.diagnosis.outcome.statements import Statements
+from ident.diagnosis.outcome.statements import LIMITS, Statements
 from ident.estimation.scores import by_side
 from ident.estimators.estimate import two_digits
 from ident.estimators.problem import condition_text
@@ -173,7 +173,7 @@ def of_diagnosis(
     said: Statements, page: Path | None, folder: Path, asked: Sequence[tuple[str, str]] = ()
 ) -> Ending:
     """The end of a diagnosis with results in `folder`. asked : lines on the comparisons asked for."""
-    shown = [line for line in said.lines if line.anchor != "limits"]
+    shown = [line for line in said.lines if line.subject != LIMITS]
     numbers = [(line.subject, line.found) for line in shown if line.level == "good"]
     numbers += asked
     look = [

@@ -40,6 +40,8 @@ REPLAYED = (
     ("joint", "joint torque", "Nm", 1.0),
 )
 """Replayed quantities: key, words, unit, scale from SI."""
+LIMITS = "limits of the data"
+"""Subject of the line that counts the notes."""
 
 
 @dataclass(frozen=True)
@@ -330,6 +332,19 @@ def _beyond_healthy(row: Plain) -> float:
     return min(share, 1.0 - float(healthy / row["test_rms_base"]) ** 2)
 
 
+def _channels(told: Sequence[Plain], names: Sequence[str]) -> str:
+    """Broken or doubtful channels, those of one kind together with what they look like."""
+    alike: dict[tuple[str, str], dict[str, None]] = {}
+    for one in told:
+        _, _, looks = str(one["what"]).rpartition("looks like ")
+        joint = _name(one["joint"], names) if one.get("joint") else ""
+        alike.setdefault((one["channel"], looks), {})[joint] = None
+    return "; ".join(
+        f"{', '.join(joints)} {channel}{f' ({looks})' * bool(looks)}".strip()
+        for (channel, looks), joints in alike.items()
+    )
+
+
 def _lines(
     content: Plain,
     details: Plain,
@@ -342,9 +357,7 @@ def _lines(
         ("broken channels", content.get("data", ()), "data"),
         ("channels in doubt", details.get("in_doubt", ()), "limits"),
     ):
-        listed = [f"{_name(d['joint'], names) if d.get('joint') else ''} {d['channel']}" for d in channels]
-        text = ", ".join(dict.fromkeys(one.strip() for one in listed))
-        found += [Line(subject, text, "none", "look", anchor)] * bool(text)
+        found += [Line(subject, _channels(channels, names), "none", "look", anchor)] * bool(channels)
     for finding in findings:
         parts = [finding.text, *(f"{label} {text}" for label, text in finding.facts[:1]), finding.confidence]
         text = "; ".join(part.rstrip(".") for part in parts if part)
@@ -379,7 +392,7 @@ def _lines(
     count = len(details.get("notes", []))
     if count:
         text = f"{count} notes on limits of these data" if count > 1 else "one note"
-        found.append(Line("limits of the data", text, "", "look", "limits"))
+        found.append(Line(LIMITS, text, "", "look", "limits"))
     return found
 
 

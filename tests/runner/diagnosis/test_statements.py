@@ -10,6 +10,7 @@ import pytest
 
 from ident.diagnosis.outcome.claims_in_words import SURE, is_open
 from ident.diagnosis.outcome.statements import statements
+from runner.ending import of_diagnosis
 from runner.experiment_file import DiagnosisPlan
 from runner.report.diagnosis import DiagnosisFolder
 from runner.report.page import diagnosis_html
@@ -249,9 +250,12 @@ def test_a_moment_is_told_with_the_name_of_its_session() -> None:
     assert "of early.mcap" in said.text()
 
 
-def test_channels_in_doubt_are_in_the_short_text() -> None:
-    doubts = [{"channel": "motor torque", "joint": joint, "what": "", "advice": ""} for joint in (1, 3, 3)]
+def test_channels_in_doubt_are_in_the_short_text_with_what_they_look_like(tmp_path: Path) -> None:
+    what = "contradicts the other channels, looks like the two joints interchanged"
+    doubts = [{"channel": "motor torque", "joint": joint, "what": what, "advice": ""} for joint in (1, 3, 3)]
     said = statements({**CONTENT, "findings": []}, details(in_doubt=doubts), NAMES)
     line = next(one for one in said.lines if one.subject == "channels in doubt")
-    assert line.found == "A1 motor torque, E1 motor torque"
+    assert line.found == "A1, E1 motor torque (the two joints interchanged)"
     assert line.level == said.level == "look"
+    (verdict,) = [one for one in of_diagnosis(said, None, tmp_path).look if one.subject == line.subject]
+    assert verdict.found == line.found
