@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from ident.estimation.channel_errors import of_exact_channels
 from ident.estimation.identify import Identification
 from ident.excitation import ExcitationPlan
 from ident.excitation.arm_model import split_name
@@ -28,15 +29,16 @@ from lwr_driver.configuration import find
 from lwr_driver.motion import Motion
 from runner.experiment import Record, Run
 from runner.experiment_file import Experiment, Payload, SessionPlan
-from runner.planning import excitation_rows, store_plan, stored_plan
-from runner.preflight import check_start
+from runner.planning import excitation_rows, session_motion, store_plan, stored_plan
 from runner.results import estimate, named_model, summarise, unseen_sessions, write_results
 from runner.status import StatusLine
 
 PLAN = "round-{}.plan.yaml"
 MODEL = "round-{}.model.yaml"
+KNOWN = "round-{}.known.yaml"
+"""That model with the deviations that a further motion may reduce."""
 # Searches for a motion with a start near home, and its row period for that check [s].
-_SEARCHES, _ROW_S = 4, 0.01
+_SEARCHES, _ROW_S = 4, 0.005
 
 
 def rounds_begun(folder: Path) -> int:
@@ -92,14 +94,18 @@ class Rounds:
         found = estimate(self.experiment, self.arm, records)
         summary = summarise(self.experiment, records, found)
         write_results(self.folder, self.experiment, self.arm, summary, found)
-        model = self.folder / MODEL.format(number - 1)
-        write_model(named_model(found.model, self.arm.name), model)
-        problem = next_problem(self.experiment, self.cell, records, found, model)
+        write_model(named_model(found.model, self.arm.name), self.folder / MODEL.format(number - 1))
+        # What no motion tells does not choose one.
+        known, file = _known_but_for_channels(found), self.folder / KNOWN.format(number - 1)
+        write_model(named_model(known.model, self.arm.name), file)
+        problem = next_problem(self.experiment, self.cell, records, known, file)
         status.show(f"planning round {number}", None, "Ctrl-C keeps the best motion so far")
-        motion = planned_near_home(self.experiment, self.arm, problem, lambda now: show_search(status, now))
+        motion = planned_to_run(
+            self.experiment, self.arm, self.cell, problem, lambda now: show_search(status, now)
+        )
         store_plan(self.folder, name, motion)
         status.clear()
-        essential = found.estimate if found.essential is None else found.essential.estimate
+        essential = known.estimate if known.essential is None else known.essential.estimate
         before = float(np.median(essential.rsd_percent))
         after = float(np.median(list(motion.rsd_percent.values())))
         status.say(
@@ -109,18 +115,32 @@ class Rounds:
         return motion
 
 
-def planned_near_home(
-    experiment: Experiment, arm: Arm, problem: PlanProblem, show: Callable[[SearchProgress], None]
+def _known_but_for_channels(found: Identification) -> Identification:
+    """An estimate with torque channels taken as exact."""
+    essential = found.essential
+    if essential is not None:
+        essential = replace(essential, estimate=of_exact_channels(essential.estimate))
+    return replace(found, estimate=of_exact_channels(found.estimate), essential=essential)
+
+
+def planned_to_run(
+    experiment: Experiment,
+    arm: Arm,
+    cell: Cell,
+    problem: PlanProblem,
+    show: Callable[[SearchProgress], None],
 ) -> ExcitationPlan:
-    """The motion of a search. If its start is too far from home for the approach, the next seed is searched.
+    """The motion of a search. If the preflight refuses it from home (a start too far away, a stop too near to the
+    cell), the next seed is searched.
 
     The motion of the last search is returned in any case; the preflight then refuses it with the reason.
     """
-    search = problem.search
+    search, home = problem.search, experiment.home(len(arm.joint_names))
+    sessions = {session.payload: session for session in experiment.sessions if not session.validation}
     for seed in range(search.seed, search.seed + _SEARCHES):
         motion = plan(replace(problem, search=replace(search, seed=seed)), show)
-        first = motion.rows(_ROW_S, 1)[0]
-        if check_start(arm, experiment.home(len(first)), first, experiment.moves.max_start_distance_rad).ok:
+        rows = excitation_rows(motion, experiment.excitation.periods)(_ROW_S)
+        if all(session_motion(experiment, arm, cell, one, rows, home)[1].ok for one in sessions.values()):
             break
     return motion
 

@@ -63,6 +63,12 @@ def beside_channel_errors(problem: Problem, estimate: Estimate) -> Estimate:
     )
 
 
+def of_exact_channels(estimate: Estimate) -> Estimate:
+    """The estimate without the errors of the torque channels in its stated covariance: no motion tells them, and they
+    are the same on each day."""
+    return replace(estimate, covariance=estimate.covariances.get(EXACT_CHANNELS, estimate.covariance))
+
+
 def channel_errors(problem: Problem, estimate: Estimate) -> ChannelErrors | None:
     """The errors that residuals of an estimate tell; None for rows of the difference of two channels."""
     if any(group.side == "difference" for group in problem.groups):

@@ -21,7 +21,7 @@ from fri.errors import LwrError
 from ident.diagnosis import Reference, commission, diagnose
 from ident.dynamics.known_arm import known_arm
 from ident.dynamics.session_chain import session_chain
-from ident.estimation.channel_errors import EXACT_CHANNELS
+from ident.estimation.channel_errors import of_exact_channels
 from ident.estimation.identify import Identification, IdentificationSettings, identify, known_settings
 from ident.estimators.least_squares import factor_of
 from ident.model.model_file import read_model, write_model
@@ -193,9 +193,7 @@ def _identification(store: ArmStore, sessions: Sequence[Session], order: Order) 
 
 
 def _write_day(store: ArmStore, day: ArmDay, found: Identification) -> None:
-    estimate = found.estimate
-    # Errors of the channels are the same each day, and no change.
-    deviations = estimate.covariances.get(EXACT_CHANNELS, estimate.covariance).std
+    estimate = of_exact_channels(found.estimate)
     weights = np.array([fit.sigma**-2 * fit.n_eff / max(fit.rows, 1) for fit in estimate.classes])
     store.write_factor(day.key, found.base.names, factor_of(found.problem, weights))
     store.write(
@@ -204,7 +202,7 @@ def _write_day(store: ArmStore, day: ArmDay, found: Identification) -> None:
         [
             {"name": name, "unit": unit, "value": float(value), "std": float(std)}
             for name, unit, value, std in zip(
-                found.base.names, found.base.units, estimate.values, deviations, strict=True
+                found.base.names, found.base.units, estimate.values, estimate.std, strict=True
             )
         ],
     )

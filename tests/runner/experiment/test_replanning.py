@@ -13,10 +13,12 @@ from ident.excitation import ExcitationPlan
 from ident.excitation.problem import PlanProblem
 from ident.model.model_file import read_model
 from lwr_driver.arm import Arm
+from lwr_driver.arm.cell import Cell
 from lwr_driver.configuration import find
 from lwr_driver.session import read_session
 from runner import replanning
-from runner.experiment_file import DEFAULT, Experiment
+from runner.experiment_file import DEFAULT, Experiment, SessionPlan
+from runner.preflight import Item, Preflight
 from tests.runner.experiment.experiment_rig import Finished, experiment_file, messages, run
 
 pytestmark = pytest.mark.slow
@@ -56,9 +58,13 @@ def test_it_is_planned_with_the_first_estimate_its_covariance_noise_and_sessions
     assert plan.check.ok
     problem = plan.provenance["problem"]
     assert [Path(entry["session"]).name for entry in problem["prior"]] == ["unloaded.mcap", "loaded.mcap"]
-    assert Path(problem["knowledge"]["file"]) == (twice.folder / "round-1.model.yaml").resolve()
-    before = read_model(twice.folder / "round-1.model.yaml")
+    assert Path(problem["knowledge"]["file"]) == (twice.folder / "round-1.known.yaml").resolve()
+    before, known = (read_model(twice.folder / f"round-1.{name}.yaml") for name in ("model", "known"))
     assert before.covariance is not None
+    assert known.covariance is not None
+    # No motion tells errors of the torque channels.
+    assert np.all(np.diag(known.covariance) <= np.diag(before.covariance))
+    assert np.any(np.diag(known.covariance) < np.diag(before.covariance))
     assert problem["knowledge"]["payload"] == "paper_load"
     # the emulator's torque noise after filtering, far below the published rows' and not a constant
     noise = np.array(problem["knowledge"]["noise_joint"])
@@ -99,26 +105,26 @@ def test_resume_keeps_a_begun_round_and_repeats_nothing_that_is_finished(twice: 
         assert messages(path) == before
 
 
-@pytest.mark.parametrize(("near", "searches"), [(3, [2, 3]), (99, [2, 3, 4, 5])])
-def test_a_motion_that_begins_too_far_from_home_is_planned_again(
-    near: int, searches: list[int], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("fit", "searches"), [(3, [2, 3]), (99, [2, 3, 4, 5])])
+def test_a_motion_that_the_preflight_refuses_is_planned_again(
+    fit: int, searches: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seeds: list[int] = []
-    experiment = Experiment.load(DEFAULT)
-    home = experiment.home(7)
+    seeds, checked = list[int](), list[str]()
+    experiment, arm = Experiment.load(DEFAULT), Arm.load()
+    refused, passed = (Preflight((Item("clearance of a stop", "", "", ok, ""),)) for ok in (False, True))
 
-    class Beginning:
-        def __init__(self, seed: int) -> None:
-            self.first = home + (0.5 if seed == near else 3.3)
-
-        def rows(self, period_s: float, periods: int) -> np.ndarray:
-            return np.tile(self.first, (3, 1))
-
-    def search(problem: PlanProblem, show: object) -> Beginning:
+    def search(problem: PlanProblem, show: object) -> ExcitationPlan:
         seeds.append(problem.search.seed)
-        return Beginning(problem.search.seed)
+        return ExcitationPlan.load(find("plans/default.plan.yaml"))
+
+    def prepared(experiment: Experiment, arm: Arm, cell: Cell, session: SessionPlan, *rest: object) -> object:
+        checked.append("none" if session.payload is None else session.payload.name)
+        return None, passed if seeds[-1] == fit else refused
 
     monkeypatch.setattr(replanning, "plan", search)
-    problem = PlanProblem.load(find("plans/replan.yaml"))
-    replanning.planned_near_home(experiment, Arm.load(), problem, lambda now: None)
+    monkeypatch.setattr(replanning, "session_motion", prepared)
+    problem, cell = PlanProblem.load(find("plans/replan.yaml")), Cell.load(experiment.cell)
+    replanning.planned_to_run(experiment, arm, cell, problem, lambda now: None)
     assert seeds == searches
+    # With each payload of the experiment.
+    assert set(checked) == {"none", "paper_load"} if fit in seeds else {"none"}
