@@ -60,8 +60,8 @@ class Worn(NamedTuple):
             return []
         listed = ", ".join(f"{_WORDS[label]} {100.0 * share:.2g} %" for label, share in self.least.items())
         return [
-            f"of a drive a change shows from about {listed} on; a smaller one may be a healthy arm's, by what the days "
-            f"of {self.sets} healthy set{'s' * (self.sets > 1)} tell"
+            f"wear of a drive would show from about {listed} on; a smaller change may be that of a healthy arm, as far "
+            f"as the days of {self.sets} healthy set{'s' * (self.sets > 1)} tell"
         ]
 
 

@@ -74,11 +74,11 @@ def test_a_healthy_day_and_an_arm_without_reference_show_no_wear(
     )
     assert not worn(healthy)
     assert not worn(alone)
-    (told,) = [note for note in healthy.notes if "of a drive a change shows" in note]
+    (told,) = [note for note in healthy.notes if "wear of a drive would show" in note]
     for label in ("inertia", "viscous friction", "Coulomb friction"):
         (percent,) = re.findall(rf"{label} ([0-9.]+) %", told)
         assert 3.0 <= float(percent) < 60.0
-    assert not any("of a drive a change shows" in note for note in alone.notes)
+    assert not any("wear of a drive would show" in note for note in alone.notes)
 
 
 def test_a_usual_gain_of_a_sensor_is_no_wear_of_its_drive(
