@@ -34,19 +34,11 @@ from ident.effects import EFFECTS, Shape
 from ident.model import DynamicModel
 from ident.rows.delay import Delay
 from ident.rows.filters import SignalSettings
+from tests.ident.diagnosis.references import bare_reference
 
 
 def reference(model: DynamicModel, null: dict[tuple[str, int], float], sets: int) -> Reference:
-    return Reference(
-        model,
-        compliance=np.zeros(3),
-        motor_delay_s=0.0,
-        joint_delay_s=0.0,
-        noise={},
-        null=null,
-        sets=sets,
-        habits=True,
-    )
+    return bare_reference(model, sets, null=null, habits=True)
 
 
 @pytest.fixture(scope="module")

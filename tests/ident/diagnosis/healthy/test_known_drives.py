@@ -15,6 +15,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling, ModelStructure
 from ident.model import DynamicModel
 from ident.model.model_file import read_model
+from tests.ident.diagnosis.references import bare_reference
 
 RATIO = np.array([101.0, 80.0, 50.0])
 
@@ -25,17 +26,7 @@ def healthy(chain: Chain, tmp_path: Path) -> Reference:
     structure = ModelStructure(chain, 1, couplings=(Coupling(chain.joint_names[1:3]),))
     base = numeric_base(structure)
     model = DynamicModel("arm", structure, base.names, np.ones(len(base)), np.eye(len(base)), base)
-    made = Reference(
-        model,
-        compliance=np.zeros(3),
-        motor_delay_s=0.0,
-        joint_delay_s=0.0,
-        noise={},
-        null={},
-        sets=2,
-        gear_ratio=RATIO,
-    )
-    made.save(tmp_path / "healthy.yaml")
+    bare_reference(model, gear_ratio=RATIO).save(tmp_path / "healthy.yaml")
     return Reference.of(read_model(tmp_path / "healthy.yaml"))
 
 

@@ -26,6 +26,7 @@ from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Condition, ModelStructure
 from ident.model import DynamicModel
+from tests.ident.diagnosis.references import bare_reference
 
 MASSES = {"weight": 2.0, "other": None}
 
@@ -52,17 +53,7 @@ def healthy(base: BaseSet, mass: float, std: float) -> Reference:
     values, covariance = np.zeros(len(base)), 1e-6 * np.eye(len(base))
     values[place], covariance[place, place] = mass, std**2
     model = DynamicModel("arm", base.structure, base.names, values, covariance, base)
-    return Reference(
-        model,
-        compliance=np.zeros(3),
-        motor_delay_s=0.0,
-        joint_delay_s=0.0,
-        noise={},
-        null={},
-        sets=2,
-        habits=True,
-        masses=MASSES,
-    )
+    return bare_reference(model, habits=True, masses=MASSES)
 
 
 def test_a_mass_is_held_against_the_healthy_one_or_the_announced_one(base: BaseSet) -> None:
