@@ -396,8 +396,8 @@ class _Bench:
         if motors and settings.stiffness_nm_rad is not None:
             reasons.append(f"positions: of the motors, as stated; the links stand behind by {by}")
             return settings, rows
-        found = at_motors(self.rows, rows, replace(settings, encoder="link"), efforts)
-        if found is None or not (motors or found.told):
+        found = at_motors(self.rows, rows, settings, efforts)
+        if found is None:
             return replace(settings, encoder=settings.encoder or "link"), rows
         if settings.stiffness_nm_rad is None and efforts is not None:
             twist = float(np.max(efforts / np.array(found.settings.stiffness_nm_rad)))
