@@ -349,7 +349,7 @@ class FrictionTemperature(Drifting):
         """Scales the friction of the drive."""
         joint = run.joint
         factor = 1.0 + self.drift(run.values, run.form, time_s)
-        if self.form_of(run.form) in (Course.HEATED, Course.CARRIED):
+        if run.shape.form in (Course.HEATED, Course.CARRIED):
             change, level = run.coefficients
             coulomb, viscous = loads.Fcm[joint], loads.Fvm[joint]
             speed = abs(float(plant.motor_velocity[joint]))

@@ -61,7 +61,7 @@ class _Twisting(Effect):
 
     def load(self, run: Simulated, time_s: float, plant: Plant, loads: Loads) -> None:
         """With the link's encoder, the motor drags against its friction."""
-        if self.form_of(run.form) is not _Encoder.MOTOR:
+        if run.shape.form is not _Encoder.MOTOR:
             past = [*(run.state or []), float(self.twist(plant.joint_torque[run.joint], run.values))][-3:]
             run.state = past
             if len(past) == 3:
@@ -69,7 +69,7 @@ class _Twisting(Effect):
 
     def sense(self, run: Simulated, time_s: float, plant: Plant, reading: Reading) -> None:
         """Displaces the position published by the motor's encoder."""
-        if self.form_of(run.form) is _Encoder.MOTOR:
+        if run.shape.form is _Encoder.MOTOR:
             reading.position[run.joint] += self.twist(plant.joint_torque[run.joint], run.values)
 
     def sentence(self, values: Values, form: Form | None, names: Sequence[str]) -> list[str]:

@@ -69,7 +69,8 @@ class _Term(Simulated):
         self.effect, self.joint, self.form = effect, joint, form
         self.values = {name: float(value) for name, value in values.items()}
         self.name, self.factor = _parts(str(form))
-        self.knots = [self.values[f"value_{k + 1}"] for k in range(KNOTS)]
+        self.knots = np.linspace(self.values["low"], self.values["high"], KNOTS)
+        self.at_knots = np.array([self.values[f"value_{k + 1}"] for k in range(KNOTS)])
         self.speed: Floats | None = None
         self.acceleration = np.zeros(0)
 
@@ -86,8 +87,7 @@ class _Term(Simulated):
             "load": plant.joint_torque,
         }
         kind, joint = _variable(self.name)
-        low, high = self.values["low"], self.values["high"]
-        value = float(between_knots(signals[kind][joint], low, high, self.knots))
+        value = float(np.interp(signals[kind][joint], self.knots, self.at_knots))
         if self.factor.startswith("sign"):
             return value * float(np.sign(plant.motor_velocity[_factor_joint(self.factor)]))
         return value * float(plant.joint_torque[_factor_joint(self.factor)]) if self.factor else value
