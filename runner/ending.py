@@ -59,8 +59,8 @@ class Ending:
             status.answer(*pieces, "")
         status.write(self.sentence, f"bold {status.STYLES[self.level]}", stream=out)
         for verdict in self.look:
-            wanted = f" (wanted: {verdict.wanted})" if verdict.wanted else ""
-            text = f"  {verdict.subject}: {verdict.found}{wanted}"
+            good = f" (a good result: {verdict.wanted})" if verdict.wanted else ""
+            text = f"  {verdict.subject}: {verdict.found}{good}"
             status.write(text, status.STYLES[verdict.level], stream=out)
         width = max((len(name) for name, _ in self.numbers), default=0)
         for name, value in self.numbers:
