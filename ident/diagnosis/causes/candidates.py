@@ -280,7 +280,7 @@ class Dictionary:
             on = np.ones((len(edges), evidence.blocks))
             on[:, mine] = starts >= edges[:, None]
             top = int(np.argmax(evidence.fitted(whole, on)))
-            score = evidence.score_products(whole.only(on[top]), list(rows))
+            (score,) = evidence.score_products([whole.only(on[top])], [list(rows)])
             at = shape.at(time=edges[top])
             score = self._timed(candidate, at, score, evidence.blocks)
             if best is None or score.gain > best[1].gain:
@@ -334,9 +334,7 @@ class Dictionary:
         onset = self._onset(candidate)
         # Shapes that hold others of this candidate, and the others.
         found: dict[bool, Trial] = {}
-        entries = self._prepared(candidate)
-        for shape, rows, known in entries:
-            score = self.measure(candidate, rows, known)
+        for shape, rows, score in self._measured(candidate):
             general = candidate.key in candidate.effect.special_cases(shape, candidate.joint)
             better = general not in found or _worth(score) > _worth(found[general].score)
             if better and candidate.effect.plausible(score.coefficients, shape):
@@ -377,8 +375,8 @@ class Dictionary:
     def scores(self, candidate: Candidate) -> dict[str, Score]:
         """Score of each shape of a candidate's grid beside the present columns, by the shape as text; empty for
         events."""
-        entries = [] if candidate.effect.event else self._prepared(candidate)
-        found = {repr(shape): self.measure(candidate, rows, known) for shape, rows, known in entries}
+        entries = [] if candidate.effect.event else self._measured(candidate)
+        found = {repr(shape): score for shape, _, score in entries}
         return {shape: score for shape, score in found.items() if np.isfinite(score.gain)}
 
     def scored(self, candidate: Candidate, shape: str) -> Score | None:
@@ -405,10 +403,16 @@ class Dictionary:
 
     def measure(self, candidate: Candidate, rows: Rows, known: Products | None = None) -> Score:
         """Score of rows by the rules of the candidate's effect; `known` : their products with the base alone."""
-        evidence, pull = self.evidence, _ABOUT_ONE**-2.0 if candidate.effect.hidden else 0.0
         if known is None:
-            return evidence.score(evidence.padded(rows), pull=pull)
-        return evidence.score_rows(rows, known, pull=pull)
+            return self.evidence.score(self.evidence.padded(rows), pull=_pull(candidate))
+        return self.evidence.score_groups([(rows, known)], pull=_pull(candidate))[0]
+
+    def _measured(self, candidate: Candidate) -> Iterator[tuple[Shape, Rows, Score]]:
+        """Each shape of a candidate's grid with its rows and their score."""
+        entries = self._prepared(candidate)
+        groups = [(rows, known) for _, rows, known in entries]
+        scores = self.evidence.score_groups(groups, pull=_pull(candidate))
+        return ((shape, rows, score) for (shape, rows, _), score in zip(entries, scores, strict=True))
 
     def _timed(self, candidate: Candidate, shape: Shape, score: Score, choices: int) -> Score:
         """The score of a shape, with the price of its time. An error of a sensor that stays has parts to be held back,
@@ -500,6 +504,11 @@ class Dictionary:
                 delayed(self.best)(candidate) for candidate in self.candidates
             )
         return (trial for trial in found if trial is not None)
+
+
+def _pull(candidate: Candidate) -> float:
+    """Precision of coefficients that the physics knows to be 1."""
+    return _ABOUT_ONE**-2.0 if candidate.effect.hidden else 0.0
 
 
 def _acts(rows: Rows) -> bool:

@@ -340,41 +340,68 @@ class Evidence:
         of them.
         known : their products with the base alone, to save time.
         """
-        return self.score_products(self.products(columns, known), list(columns), ridge=ridge, pull=pull)
+        products = self.products(columns, known)
+        return self.score_products([products], [list(columns)], ridge=ridge, pull=pull)[0]
 
-    def score_rows(self, rows: Rows, known: Products, *, pull: float = 0.0) -> Score:
-        """Score of rows with known products with the base alone."""
-        return self.score_products(self.products(partial(self.padded, rows), known), list(rows), pull=pull)
+    def score_groups(self, groups: Sequence[tuple[Rows, Products]], *, pull: float = 0.0) -> list[Score]:
+        """Scores of groups of rows, each with its products with the base alone; those of as many columns together."""
+        some = [self.products(partial(self.padded, rows), known) for rows, known in groups]
+        found: dict[int, Score] = {}
+        for size in {one.own.shape[1] for one in some}:
+            alike = [k for k, one in enumerate(some) if one.own.shape[1] == size]
+            keys = [list(groups[k][0]) for k in alike]
+            found |= zip(alike, self.score_products([some[k] for k in alike], keys, pull=pull), strict=True)
+        return [found[k] for k in range(len(some))]
 
     def score_products(
-        self, products: Products, keys: Sequence[Key], *, ridge: float = 0.0, pull: float = 0.0
-    ) -> Score:
-        """Score of columns in the rows of `keys` from their products with all present columns."""
-        base, own, target = products.sums
-        whole = base.sum(axis=0), own.sum(axis=0), target.sum(axis=0)
-        one = whole[0][None], whole[1][None], whole[2][None]
-        (projection,), (inner,), (moment,), (sound,) = schur(one, self.full, ridge)
-        k = products.own.shape[1]
-        if not sound:
-            return Score(-np.inf, 0.0, np.zeros(k), 0.0, lambda: (np.eye(k), 0), 1.0)
-        coefficients = inner @ moment
-        fitted = float(moment @ coefficients)
-        gain = fitted
-        if fitted > _NO_EVIDENCE:
-            rest = whole[0] - base, whole[1] + pull * np.eye(k) - own, whole[2] + pull - target
-            gain = self._held_gain(products.sums, rest, ridge)
-        rows = sum(self._independent[key] for key in keys)
-        if self.prior is not None and self.compared and fitted > _NO_EVIDENCE:
-            changed = self.full.values - projection @ coefficients
-            gain += self._prior_penalty(self.full.values) - self._prior_penalty(changed)
-        # Held-back error can also fall after a poor fit of the base without the part: never more than the
-        # fitted gain.
-        gain = min(gain, fitted)
-        if self._free is not None:
-            # A cause explained by base parameters without the prior could only make up for a wrong drawing.
-            left = left_beside(whole[0], whole[1], self._free.inverse)
-            gain = min(gain, 0.0) if np.all(left < _OWN_SHARE * np.diag(whole[1])) else gain
-        values, gram, torque = self.full.values - projection @ coefficients, self.gram, self.target
+        self,
+        groups: Sequence[Products],
+        keys: Sequence[Sequence[Key]],
+        *,
+        ridge: float = 0.0,
+        pull: float = 0.0,
+    ) -> list[Score]:
+        """Scores of groups of k columns each in the rows of their `keys`, from their products with all present ones."""
+        base, own, target = (np.stack(of) for of in zip(*(one.sums for one in groups), strict=True))
+        whole = base.sum(axis=1), own.sum(axis=1), target.sum(axis=1)
+        projection, inner, moment, sound = schur(whole, self.full, ridge)
+        k = own.shape[-1]
+        coefficients = (inner @ moment[..., None])[..., 0]
+        fitted = np.einsum("mk,mk->m", moment, coefficients)
+        gain = fitted.copy()
+        held = np.flatnonzero(sound & (fitted > _NO_EVIDENCE))
+        if len(held):
+            mine = base[held], own[held], target[held]
+            sums = whole[0][held, None], whole[1][held, None] + pull * np.eye(k), whole[2][held, None] + pull
+            rest = sums[0] - mine[0], sums[1] - mine[1], sums[2] - mine[2]
+            gain[held] = self._held_gain(mine, rest, ridge)
+        found = []
+        for m, (products, of) in enumerate(zip(groups, keys, strict=True)):
+            if not sound[m]:
+                found.append(Score(-np.inf, 0.0, np.zeros(k), 0.0, lambda: (np.eye(k), 0), 1.0))
+                continue
+            values = self.full.values - projection[m] @ coefficients[m]
+            most = float(gain[m])
+            if self.prior is not None and self.compared and fitted[m] > _NO_EVIDENCE:
+                most += self._prior_penalty(self.full.values) - self._prior_penalty(values)
+            # Held-back error can also fall after a poor fit of the base without the part: never more than the
+            # fitted gain.
+            most = min(most, float(fitted[m]))
+            if self._free is not None:
+                # A cause explained by base parameters without the prior could only make up for a wrong drawing.
+                left = left_beside(whole[0][m], whole[1][m], self._free.inverse)
+                most = min(most, 0.0) if np.all(left < _OWN_SHARE * np.diag(whole[1][m])) else most
+            rows = sum(self._independent[key] for key in of)
+            robust = self._robust(products, values, coefficients[m], projection[m], inner[m])
+            inflation = most / max(rows, 1.0)
+            found.append(Score(most, float(fitted[m]), coefficients[m], inflation, robust))
+        return found
+
+    def _robust(
+        self, products: Products, values: Floats, coefficients: Floats, projection: Floats, inner: Floats
+    ) -> Callable[[], tuple[Floats, int]]:
+        """Covariance (k, k) of coefficients (k,) from the blocks and the number of these, on demand."""
+        gram, torque = self.gram, self.target
 
         def robust() -> tuple[Floats, int]:
             own = products.target - products.base @ values - products.own @ coefficients
@@ -385,7 +412,7 @@ class Evidence:
             middle = active / max(active - 1, 1) * scores.T @ scores
             return widened(inner @ middle @ inner, inner), active
 
-        return Score(gain, fitted, coefficients, gain / max(rows, 1.0), robust)
+        return robust
 
     def fitted(self, products: Products, on: Floats) -> Floats:
         """Fall (m,) of the chi-square on the fitted rows by columns in m choices of the blocks, `on` (m, blocks)."""
@@ -402,16 +429,17 @@ class Evidence:
         gain = score.fitted - penalty if np.isfinite(score.gain) else -np.inf
         return replace(score, gain=gain, chance=p)
 
-    def _held_gain(self, mine: Sums, rest: Sums, ridge: float) -> float:
-        """Fall of the chi-square on each part of the motion, the columns fitted on the rest; the sum of all parts."""
+    def _held_gain(self, mine: Sums, rest: Sums, ridge: float) -> Floats:
+        """Fall (m,) of the chi-square on each part of the motion, the columns of each of m groups fitted on the rest;
+        the sum of all parts."""
         projection, inner, moment, _ = schur(rest, self._held, ridge)
         cross, own, target = mine
-        c = inner @ moment[:, :, None]
+        c = inner @ moment[..., None]
         change = -(projection @ c)
-        own_moment = target[:, :, None] - cross @ self._held.values[:, :, None]
-        linear = 2.0 * (np.sum(change[:, :, 0] * self._part_moment) + np.sum(c * own_moment))
-        square = np.sum(change * (self._part_gram @ change)) + np.sum(c * (2.0 * (cross @ change) + own @ c))
-        return float(linear - square)
+        own_moment = target[..., None] - cross @ self._held.values[..., None]
+        square = change * (self._part_gram @ change - 2.0 * self._part_moment[..., None])
+        square_own = c * (2.0 * (cross @ change) + own @ c - 2.0 * own_moment)
+        return np.asarray(-square.sum(axis=(1, 2, 3)) - square_own.sum(axis=(1, 2, 3)))
 
     def _prior_penalty(self, values: Floats) -> float:
         if self.prior is None:

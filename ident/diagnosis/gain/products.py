@@ -119,24 +119,24 @@ def block_sums(parts: Floats, values: Floats) -> Floats:
 
 
 def schur(products: Sums, fit: Fit, ridge: float) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
-    """Projection on the base (m, P, k), inverse of the Schur complement (m, k, k), and product with the residual (m, k)
-    of columns with the products base (m, k, P), own (m, k, k) and target (m, k) in each of m sets of rows.
+    """Projection on the base (..., P, k), inverse of the Schur complement (..., k, k), and product with the residual
+    (..., k) of columns with the products base (..., k, P), own (..., k, k) and target (..., k).
 
-    Last (m,), whether the columns are something of their own beside the base; the inverse is zero elsewhere.
+    Last (...,), whether the columns are something of their own beside the base; the inverse is zero elsewhere.
     """
     cross, own, target = products
-    projection = fit.inverse @ cross.transpose(0, 2, 1)
+    projection = fit.inverse @ cross.swapaxes(-1, -2)
     inner = own - cross @ projection
-    power, left = np.einsum("mkk->mk", own), np.einsum("mkk->mk", inner)
-    sound = ((power > 0.0) & (left >= _LEAST_LEFT * power)).all(axis=1)
-    moment = target - (cross @ fit.values[..., None])[:, :, 0]
-    eye, at = np.eye(power.shape[1]), sound[:, None, None]
-    root = np.sqrt(np.where(sound[:, None], left + ridge * power, 1.0))
-    both = root[:, :, None] * root[:, None, :]
+    power, left = np.einsum("...kk->...k", own), np.einsum("...kk->...k", inner)
+    sound = ((power > 0.0) & (left >= _LEAST_LEFT * power)).all(axis=-1)
+    moment = target - (cross @ fit.values[..., None])[..., 0]
+    eye, at = np.eye(power.shape[-1]), sound[..., None, None]
+    root = np.sqrt(np.where(sound[..., None], left + ridge * power, 1.0))
+    both = root[..., :, None] * root[..., None, :]
     if len(eye) == 1:
         # Most groups are one column.
         return projection, at / both, moment, sound
-    scaled = np.where(at, (inner + ridge * power[:, :, None] * eye) / both, eye)
-    sound = sound & (np.linalg.eigvalsh(scaled)[:, 0] >= 1e-9)
-    at = sound[:, None, None]
+    scaled = np.where(at, (inner + ridge * power[..., :, None] * eye) / both, eye)
+    sound = sound & (np.linalg.eigvalsh(scaled)[..., 0] >= 1e-9)
+    at = sound[..., None, None]
     return projection, at * np.linalg.inv(np.where(at, scaled, eye)) / both, moment, sound
