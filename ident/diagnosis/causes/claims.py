@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 from ident.diagnosis.causes.candidates import Candidate, Dictionary, Trial
 from ident.diagnosis.causes.contest import Contest, gain_of
@@ -46,12 +47,22 @@ def claim_of(contest: Contest, accepted: Sequence[Trial], k: int) -> Claim:
     rest = contest.without(accepted, k)
     taken = {t.candidate.key for t in rest if not t.candidate.effect.repeats}
     again = dictionary.trial(here.candidate, here.shape, choices(here, evidence)) or here
-    rivals = [t for t in contest.rivals() if t.candidate.key not in {*taken, here.candidate.key}]
-    # A rival in other rows, or in rows with little power of this one, explains something else.
+    taken.add(here.candidate.key)
     mine = powers(again, dictionary)
     least = _SAME_ROWS * sum(mine.values())
-    rivals = [t for t in rivals if sum(mine.get(key, 0.0) for key in t.rows) > least]
-    close = [t for t in rivals[:6] if gain_of(t) > 0.6 * gain_of(again)]
+
+    def in_its_rows(trial: Trial) -> bool:
+        # A rival in other rows, or in rows with little power of this one, explains something else.
+        return trial.candidate.key not in taken and sum(mine.get(key, 0.0) for key in trial.rows) > least
+
+    def near(trial: Trial) -> bool:
+        return gain_of(trial) > 0.6 * gain_of(again) and in_its_rows(trial)
+
+    def physical(trial: Trial) -> bool:
+        one = trial.candidate
+        return one.joint == here.candidate.joint and one.effect.side == "joint" and in_its_rows(trial)
+
+    close = list(islice(contest.rivals(near), 6))
     close = contest.competing(again, [dictionary.refine(t, choices(t, evidence)) for t in close], rest)
     scores = sorted(((t.candidate, gain_of(t)) for t in close), key=lambda pair: -pair[1])
     sure = confidence(gain_of(again), [g for _, g in scores])
@@ -59,12 +70,7 @@ def claim_of(contest: Contest, accepted: Sequence[Trial], k: int) -> Claim:
     if here.candidate.effect.side == "sensor" and "motor" not in dictionary.nominal.rows:
         # Without a motor torque only the shape distinguishes a sensor's error from a torque of the arm.
         sure = min(sure, _SHAPE_ALONE)
-        physical = (
-            (t.candidate, gain_of(t))
-            for t in rivals
-            if t.candidate.joint == here.candidate.joint and t.candidate.effect.side == "joint"
-        )
-        alike = alike or tuple(physical)[:1]
+        alike = alike or tuple((t.candidate, gain_of(t)) for t in islice(contest.rivals(physical), 1))
     twin = _same_torque(dictionary, here.candidate)
     if twin is not None:
         sure, alike = min(sure, _EITHER), (*alike, (twin, gain_of(again)))

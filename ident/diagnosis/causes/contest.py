@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
+from functools import partial
+from itertools import islice
 
 import numpy as np
 
@@ -38,6 +40,11 @@ _LATEST = 6
 def gain_of(trial: Trial) -> float:
     """Gain for the order of candidates, with a penalty for freedom."""
     return trial.score.gain - 2.0 * trial.shape.freedom
+
+
+def _is_near(trial: Trial, *, least: float, taken: Container[tuple[str, int]]) -> bool:
+    """Whether a trial of another candidate than those `taken` has more than the least gain."""
+    return trial.candidate.key not in taken and gain_of(trial) > least
 
 
 def same_moment(trial: Trial, other: Trial) -> bool:
@@ -116,10 +123,11 @@ class Contest:
 
         return [t for t in found if needed(t)]
 
-    def rivals(self) -> list[Trial]:
-        """The simplest candidates by their gain, best first. A gain as on the healthy arm explains nothing."""
-        found = [t for t in self.simplest() if self.null.exceeded(t)]
-        return sorted(found, key=gain_of, reverse=True)
+    def rivals(self, wanted: Callable[[Trial], bool]) -> Iterator[Trial]:
+        """The wanted ones of the simplest candidates, best first, each looked at as it is asked for. A gain as on the
+        healthy arm explains nothing."""
+        found = sorted(filter(wanted, self.simplest()), key=gain_of, reverse=True)
+        return filter(self.null.exceeded, found)
 
     def next(self, accepted: Sequence[Trial], carried: list[Trial]) -> Trial | None:
         """The foremost of the trials, without remainders of the accepted ones; None if there is none."""
@@ -189,9 +197,9 @@ class Contest:
                 rest = self.without(accepted, k)
                 taken = {t.candidate.key for t in rest if not t.candidate.effect.repeats}
                 again = self.dictionary.trial(here.candidate, here.shape, choices(here, self.evidence))
-                rivals = [t for t in self.rivals() if t.candidate.key not in taken]
-                contest = [t for t in rivals[:3] if again is None or gain_of(t) > 0.9 * gain_of(again)]
-                contest = [self.dictionary.refine(t, choices(t, self.evidence)) for t in contest]
+                least = -np.inf if again is None else 0.9 * gain_of(again)
+                near = self.rivals(partial(_is_near, least=least, taken=taken))
+                contest = [self.dictionary.refine(t, choices(t, self.evidence)) for t in islice(near, 3)]
                 if again is not None:
                     contest = [*self.competing(again, contest, rest), again]
                 best = max(contest, key=gain_of) if contest else None
