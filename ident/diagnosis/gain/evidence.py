@@ -97,6 +97,8 @@ class Evidence:
         self.extra: list[Rows] = []
         self._known: dict[int, tuple[Rows, dict[Key, Floats], Products]] = {}
         self._joined: dict[tuple[int, ...], dict[Key, Floats]] = {}
+        self._kept_held: tuple[Fit, Floats] | None = None
+        self._kept_free: Fit | None = None
         self._base_products()
         self._gram()
 
@@ -177,7 +179,7 @@ class Evidence:
         return [self.full.values[place].copy() for place, _ in self._places()]
 
     def _gram(self) -> None:
-        """Products of base and further columns, and the fits with and without each part of the motion."""
+        """Products of base and further columns, and their fit."""
         p = self.base_count
         size = p + sum(width_of(rows) for rows in self.extra)
         self.gram, self.target = np.zeros((self.blocks, size, size)), np.zeros((self.blocks, size))
@@ -194,17 +196,32 @@ class Evidence:
                     self.gram[:, there, here] = cross.transpose(0, 2, 1)
         self._scale = scale_of(np.einsum("bii->i", self.gram))
         self._part_gram, self._part_target = block_sums(self.parts, self.gram), self.parts @ self.target
-        gram, target = self._part_gram.sum(axis=0), self._part_target.sum(axis=0)
-        self.full = self._fit(gram, target)
-        self._free = None
-        if self.drawn:
-            self._free = self._fit(gram, target, with_prior=False)
-        held = [
-            self._fit(gram - g, target - t) for g, t in zip(self._part_gram, self._part_target, strict=True)
-        ]
-        self._held = Fit(np.array([fit.values for fit in held]), np.array([fit.inverse for fit in held]))
-        left = self._part_gram @ self._held.values[:, :, None]
-        self._part_moment = self._part_target - left[:, :, 0]
+        self.full = self._fit(self._part_gram.sum(axis=0), self._part_target.sum(axis=0))
+        self._kept_held, self._kept_free = None, None
+
+    # Where columns are only tried, these two are not asked for.
+
+    @property
+    def _held(self) -> tuple[Fit, Floats]:
+        """Fits (parts, ...) without each part of the motion, and the products (parts, P) of the columns with what they
+        leave of its torques."""
+        if self._kept_held is None:
+            gram, target = self._part_gram, self._part_target
+            fits = [
+                self._fit(g, t)
+                for g, t in zip(gram.sum(axis=0) - gram, target.sum(axis=0) - target, strict=True)
+            ]
+            held = Fit(np.array([fit.values for fit in fits]), np.array([fit.inverse for fit in fits]))
+            self._kept_held = held, target - (gram @ held.values[:, :, None])[:, :, 0]
+        return self._kept_held
+
+    @property
+    def _free(self) -> Fit | None:
+        """The fit without the prior where that is the arm's drawing, else None."""
+        if self.drawn and self._kept_free is None:
+            gram, target = self._part_gram.sum(axis=0), self._part_target.sum(axis=0)
+            self._kept_free = self._fit(gram, target, with_prior=False)
+        return self._kept_free
 
     @property
     def drawn(self) -> bool:
@@ -375,7 +392,7 @@ class Evidence:
             sums = whole[0][held, None], whole[1][held, None] + pull * np.eye(k), whole[2][held, None] + pull
             rest = sums[0] - mine[0], sums[1] - mine[1], sums[2] - mine[2]
             gain[held] = self._held_gain(mine, rest, ridge)
-        found = []
+        found, free = [], self._free
         for m, (products, of) in enumerate(zip(groups, keys, strict=True)):
             if not sound[m]:
                 found.append(Score(-np.inf, 0.0, np.zeros(k), 0.0, lambda: (np.eye(k), 0), 1.0))
@@ -387,9 +404,9 @@ class Evidence:
             # Held-back error can also fall after a poor fit of the base without the part: never more than the
             # fitted gain.
             most = min(most, float(fitted[m]))
-            if self._free is not None:
+            if free is not None:
                 # A cause explained by base parameters without the prior could only make up for a wrong drawing.
-                left = left_beside(whole[0][m], whole[1][m], self._free.inverse)
+                left = left_beside(whole[0][m], whole[1][m], free.inverse)
                 most = min(most, 0.0) if np.all(left < _OWN_SHARE * np.diag(whole[1][m])) else most
             rows = sum(self._independent[key] for key in of)
             robust = self._robust(products, values, coefficients[m], projection[m], inner[m])
@@ -432,12 +449,13 @@ class Evidence:
     def _held_gain(self, mine: Sums, rest: Sums, ridge: float) -> Floats:
         """Fall (m,) of the chi-square on each part of the motion, the columns of each of m groups fitted on the rest;
         the sum of all parts."""
-        projection, inner, moment, _ = schur(rest, self._held, ridge)
+        held, left = self._held
+        projection, inner, moment, _ = schur(rest, held, ridge)
         cross, own, target = mine
         c = inner @ moment[..., None]
         change = -(projection @ c)
-        own_moment = target[..., None] - cross @ self._held.values[..., None]
-        square = change * (self._part_gram @ change - 2.0 * self._part_moment[..., None])
+        own_moment = target[..., None] - cross @ held.values[..., None]
+        square = change * (self._part_gram @ change - 2.0 * left[..., None])
         square_own = c * (2.0 * (cross @ change) + own @ c - 2.0 * own_moment)
         return np.asarray(-square.sum(axis=(1, 2, 3)) - square_own.sum(axis=(1, 2, 3)))
 
@@ -468,7 +486,7 @@ class Evidence:
         found = {}
         for side, rows in self.nominal.rows.items():
             out = np.full(rows.target.shape, np.nan)
-            for part, values in zip(self.parts, self._held.values, strict=True):
+            for part, values in zip(self.parts, self._held[0].values, strict=True):
                 mine = (part > 0.0)[self._block[side]]
                 out[mine] = rows.target[mine] - self.predicted(side, values, mine)
             found[side] = np.where(rows.valid & ~rows.test[:, None], out, np.nan)
