@@ -33,6 +33,7 @@ from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Estimate, Estimator
 from ident.estimators.physical import lacking_bodies
 from ident.estimators.problem import Nuisance, Problem
+from ident.rows.content import Recall
 from ident.rows.sessions import require
 from lwr_driver.session import Session, Sessions, as_sessions
 
@@ -45,6 +46,7 @@ def choose(
     tilt: bool | None = None,
     known: Known | None = None,
     like: Choice | None = None,
+    recall: Recall | None = None,
 ) -> Identification:
     """The arm identified by the candidate with the least held-back error; arguments as for `identify`.
 
@@ -58,7 +60,7 @@ def choose(
     require(chain, Chain, "chain", "read one with `Chain.from_urdf`")
     prior = settings.model != 3 and not lacking_bodies(chain)
     plain = replace(settings, estimator="map" if prior else "wls", essential=None)
-    rows = observed(sessions, chain, plain, known=known)
+    rows = observed(sessions, chain, plain, known=known, recall=recall)
     # With a prior the covariance is the posterior's, whatever the settings.
     first = rows.identified(replace(rows.settings, covariance=PLAIN) if prior else rows.settings)
     choice = compared(first, sessions, tilt=tilt, recall=rows.recall) if like is None else _again(like)

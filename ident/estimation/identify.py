@@ -421,6 +421,7 @@ def identify(
     settings: IdentificationSettings | None = None,
     *,
     known: Known | None = None,
+    recall: Recall | None = None,
 ) -> Identification:
     """Identify the arm `chain` from one or more sessions, stacked.
 
@@ -429,6 +430,7 @@ def identify(
     settings : default `known_settings`, with the result of `lwr-run identify`; given ones are taken as they are.
     known : of these sessions, from an earlier identification with the same signal settings; they are not screened
         again.
+    recall : as for `prepare`.
 
     Raises ConfigurationError for arguments of a wrong type, DataError for unusable sessions.
     """
@@ -440,8 +442,8 @@ def identify(
     if settings.estimator == AUTO:
         from ident.estimation.automatic import choose
 
-        return choose(sessions, chain, settings, known=known)
-    rows = observed(sessions, chain, settings, known=known)
+        return choose(sessions, chain, settings, known=known, recall=recall)
+    rows = observed(sessions, chain, settings, known=known, recall=recall)
     return rows.identified(rows.settings)
 
 
@@ -474,7 +476,12 @@ def known_settings(
 
 
 def observed(
-    sessions: Sessions, chain: Chain, settings: IdentificationSettings, *, known: Known | None = None
+    sessions: Sessions,
+    chain: Chain,
+    settings: IdentificationSettings,
+    *,
+    known: Known | None = None,
+    recall: Recall | None = None,
 ) -> Observed:
     """The rows of the sessions for any estimator; arguments and errors as for `identify`."""
     sessions = as_sessions(sessions)
@@ -511,7 +518,7 @@ def observed(
         settings.coulomb or Coulomb(),
         () if sensed else ("motor",),
     )
-    first, recall = known is None, Recall()
+    first, recall = known is None, recall or Recall()
     if known is None:
         found = require_sound(
             chosen, chain, settings.signals, settings.couplings, motor=needs_motor, recall=recall

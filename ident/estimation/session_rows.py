@@ -111,8 +111,12 @@ def session_rows(
     motor: bool,
     advise: bool,
     recall: Recall,
+    instruments: bool = True,
 ) -> SessionRows:
-    """The rows of one session with the payload mounted in it; arguments as for `prepare` and `observe`."""
+    """The rows of one session with the payload mounted in it; arguments as for `prepare` and `observe`.
+
+    instruments : False makes no rows of the commanded motion.
+    """
     whole = prepare(
         session,
         signals,
@@ -125,7 +129,7 @@ def session_rows(
     )
     seen = observe([whole], [payload], structure, columns=base.columns, names=base.names, units=base.units)
     problem = without_dead(seen, session)
-    motion = None if signals.average_periods else commanded(session, whole)
+    motion = commanded(session, whole) if instruments and not signals.average_periods else None
     bare = replace(whole.without_samples(), settings=signals)
     del whole
     if motion is None:
@@ -149,9 +153,14 @@ def with_delays(
     """
     setting = {"joint": "joint_delay_s", "motor": "motor_delay_s"}
 
-    def at(number: int, settings: SignalSettings, delay_s: float) -> SessionRows:
+    def at(number: int, settings: SignalSettings, delay_s: float, **more: Any) -> SessionRows:
         stated: dict[str, Any] = {setting[made[number].side]: delay_s}
-        return make(*of[number], signals=replace(settings, **stated))
+        return make(*of[number], signals=replace(settings, **stated), **more)
+
+    def seen(number: int, settings: SignalSettings) -> Callable[[float], SessionRows]:
+        """Rows of the side of the delay alone."""
+        motor: dict[str, Any] = {} if made[number].side == "motor" else {"motor": False}
+        return partial(at, number, settings, instruments=False, **motor)
 
     untold = [
         k
@@ -163,7 +172,7 @@ def with_delays(
         some = untold[first : first + _TOGETHER]
         motor = any(made[k].side == "motor" for k in some)
         wide = for_delays([of[k][0] for k in some], signals, motor=motor)
-        told = _told([partial(at, k, wide) for k in some])
+        told = _told([seen(k, wide) for k in some])
         for k, delay in zip(some, told, strict=True):
             if delay is None:
                 continue
@@ -199,7 +208,11 @@ def _told(at: Sequence[Callable[[float], SessionRows]]) -> list[Delay | None]:
 
     at : rows of each at a delay [s].
     """
-    made = [one(0.0) for one in at]
+    try:
+        made = [one(0.0) for one in at]
+    except DataError as error:
+        logger.info("no rows for a delay from the base model: %s", error)
+        return [None] * len(at)
     found, sides = list(made), {k: one.side for k, one in enumerate(made) if one.delay is not None}
     told: list[Delay | None] = [None] * len(made)
     for _ in range(_DELAY_STEPS):

@@ -23,6 +23,7 @@ from ident.estimation.scores import Predictor, SessionScore, score_session
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import Model, as_model
 from ident.model.signals import signal_settings
+from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import prepare
 from ident.rows.prepared import PreparedSession, TorqueChannel
@@ -163,6 +164,7 @@ def validate(
     estimate_delay: bool = False,
     keep_going: bool = False,
     known: Known | None = None,
+    recall: Recall | None = None,
 ) -> Validation:
     """Computed-torque test of a model on sessions.
 
@@ -171,7 +173,7 @@ def validate(
     allow_seen : score sessions the model was fitted to as well, and label them; otherwise they are refused.
     estimate_delay : estimate the delay of the motor channel in each session instead.
     keep_going : list sessions without a score in `unscored` instead of raising.
-    known : of the sessions, from an earlier step; they are not screened again.
+    known : of the sessions, from an earlier step; they are not screened again. recall : as for `prepare`.
 
     Raises ConfigurationError for arguments of a wrong type. Raises DataError for a session of another robot,
     with a payload missing in the model, without any channel of the model, with a channel that is certainly wrong,
@@ -195,7 +197,7 @@ def validate(
                 )
             predict = predictor(model, mounted(model, session))
             settle([doubt for doubt in doubts if doubt.certain and doubt.session in ("", session.path.name)])
-            prepared = prepared_session(model, session, settings, blocks=not model.remembers)
+            prepared = prepared_session(model, session, settings, blocks=not model.remembers, recall=recall)
             sides = model.structure.sides
             units = model.structure.chain.torque_units
             scores.append(
@@ -307,17 +309,22 @@ def mounted(model: DynamicModel, session: Session) -> str | None:
 
 
 def prepared_session(
-    model: DynamicModel, session: Session, settings: SignalSettings | None, *, blocks: bool = False
+    model: DynamicModel,
+    session: Session,
+    settings: SignalSettings | None,
+    *,
+    blocks: bool = False,
+    recall: Recall | None = None,
 ) -> PreparedSession:
     """The session with the joints of the model, filtered as for the estimation (settings: `signals_for`).
 
-    blocks : as for `prepare`.
+    blocks, recall : as for `prepare`.
     """
     chosen = session.select(model.structure.chain.joint_names)
     signals, own = signals_for(model, settings), signals_for(model)
     # Cut-offs of the model are no choice of the session's.
     advise = (signals.cutoff_hz, signals.decimate_hz) != (own.cutoff_hz, own.decimate_hz)
-    return prepare(chosen, signals, motor=_has_motor(model), advise=advise, blocks=blocks)
+    return prepare(chosen, signals, motor=_has_motor(model), advise=advise, blocks=blocks, recall=recall)
 
 
 def _few(lines: Sequence[str]) -> list[str]:

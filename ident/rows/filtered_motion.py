@@ -106,10 +106,8 @@ def recalled(
     make = partial(WideMotion.of, part, low, high, effort_flags, times, settings, stiffness)
     if high - low < part.count or 8 * effort_flags.shape[1] * part.count >= LEAST_BYTES:
         return make()
-    springs = (
-        None if stiffness is None else (settings.stiffness_nm_rad, settings.encoder, settings.joint_delay)
-    )
-    return recall.of(make, *same, springs, part.start, most=_MOST_MOTIONS)
+    springs = () if stiffness is None else (*stiffness.tolist(), settings.encoder == "motor", settings.joint_delay)
+    return recall.of(make, *same, *springs, part.start, most=_MOST_MOTIONS)
 
 
 @dataclass(frozen=True)

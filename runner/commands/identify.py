@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ident.dynamics.kinematics import Chain
     from ident.estimation.identify import Identification, IdentificationSettings
     from ident.estimation.mounting import Mounting
+    from ident.rows.content import Recall
     from lwr_driver.session import Session
 
 _SUMMARIES = {
@@ -144,6 +145,7 @@ def command(
     from ident.estimation.identify import known_settings
     from ident.estimation.validate import validate
     from ident.model.model_file import write_model
+    from ident.rows.content import Recall
     from runner.ending import of_estimate, of_folder
     from runner.estimation import (
         IdentifySettings,
@@ -172,8 +174,9 @@ def command(
     wanted = known_settings(logs, chain, wanted, model=model)
     check_spans(logs, wanted, file)
     status.show("estimating the model")
+    recall = Recall()
     with of_file(settings):
-        found, mounting = _estimate(logs, chain, wanted, estimator, tilt=tilt)
+        found, mounting = _estimate(logs, chain, wanted, estimator, tilt=tilt, recall=recall)
     result = named_model(
         found.essential_model if essential else found.model, logs[0].metadata.get("robot", "") or "arm"
     )
@@ -186,7 +189,8 @@ def command(
         write_model(result, out)
     status.show("testing the model")
     if results is None or as_json:
-        fit = validate(result, logs, allow_seen=True, keep_going=True, known=found.known).to_dict()
+        scored = validate(result, logs, allow_seen=True, keep_going=True, known=found.known, recall=recall)
+        fit = scored.to_dict()
         content |= {"fit": fit["sessions"], "unscored": fit["unscored"]}
     validation = None
     if tested:
@@ -213,13 +217,19 @@ def command(
 
 
 def _estimate(
-    logs: Sequence[Session], chain: Chain, wanted: IdentificationSettings, estimator: str, *, tilt: bool
+    logs: Sequence[Session],
+    chain: Chain,
+    wanted: IdentificationSettings,
+    estimator: str,
+    *,
+    tilt: bool,
+    recall: Recall,
 ) -> tuple[Identification, Mounting | None]:
     """The estimate, and the tilt of the base where it was asked for; `auto` has its own in its choice."""
     if estimator == AUTO:
         from ident.estimation.automatic import choose
 
-        return choose(logs, chain, wanted, tilt=tilt or None), None
+        return choose(logs, chain, wanted, tilt=tilt or None, recall=recall), None
     if tilt:
         from ident.estimation.mounting import find_mounting
 
@@ -227,4 +237,4 @@ def _estimate(
         return mounting.identification, mounting
     from ident.estimation.identify import identify
 
-    return identify(logs, chain, wanted), None
+    return identify(logs, chain, wanted, recall=recall), None
