@@ -47,7 +47,7 @@ def consumed_parameters(problem: Problem, weights: Floats, root: Floats) -> Floa
     """
     return np.array(
         [
-            weight * float(np.sum((row_class.factor.r[:, :-1] @ root) ** 2))
+            weight * float(np.sum((row_class.factor.filled[:, :-1] @ root) ** 2))
             for row_class, weight in zip(problem.classes, weights, strict=True)
         ]
     )

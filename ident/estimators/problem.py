@@ -18,7 +18,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from fri.errors import DataError
 from ident.dynamics.parameters import Floats
-from lwr_driver.session.spool import stored
+from lwr_driver.session.spool import spans, stored
 
 _QR_ROWS = 4096
 _GRAM_PIVOT = 1e-5
@@ -110,8 +110,13 @@ class TriangularFactor:
     def combine(cls, factors: Iterable[TriangularFactor], weights: Iterable[float]) -> TriangularFactor:
         """Factor of the stack of all parts, their rows multiplied by sqrt(weight)."""
         parts = [(factor, weight) for factor, weight in zip(factors, weights, strict=True) if factor.rows]
-        stack = np.vstack([np.sqrt(weight) * factor.r for factor, weight in parts])
+        stack = np.vstack([np.sqrt(weight) * factor.filled for factor, weight in parts])
         return cls(_triangle(stack), sum(factor.rows for factor, _ in parts))
+
+    @cached_property
+    def filled(self) -> Floats:
+        """The rows of R that are not zero: a joint's rows have none for the links before it."""
+        return self.r[self.r.any(axis=1)]
 
     @property
     def parameters(self) -> int:
@@ -131,7 +136,7 @@ class TriangularFactor:
 
     def sum_of_squares(self, values: Floats) -> float:
         """||y - A chi||^2 for values (p,)."""
-        return float(np.sum((self.r @ np.append(-values, 1.0)) ** 2))
+        return float(np.sum((self.filled @ np.append(-values, 1.0)) ** 2))
 
     def solve(self) -> Floats:
         """Least-squares solution (p,). The matrix must have full rank: see `Problem.require_rank`."""
@@ -316,10 +321,9 @@ def _listed(names: Sequence[str], limit: int = 12) -> str:
 
 def _acting(matrix: Floats) -> NDArray[np.int64]:
     """Columns with a nonzero entry; a joint's rows have none for the links before it."""
-    idle = np.flatnonzero(~matrix[:: max(1, len(matrix) // 16)].any(axis=0))
-    acting = np.ones(matrix.shape[1], dtype=bool)
-    for column in idle:
-        acting[column] = bool(np.any(matrix[:, column]))
+    acting = np.zeros(matrix.shape[1], dtype=bool)
+    for some in spans(len(matrix), _QR_ROWS):
+        acting |= matrix[some].any(axis=0)
     return np.flatnonzero(acting)
 
 

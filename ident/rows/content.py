@@ -65,7 +65,7 @@ def content(*things: Any) -> bytes:
     A session counts with its channels, phases and metadata; the rest of its log has no part in rows.
     """
     known: dict[int, bytes] = {}
-    whole = hashlib.blake2b(digest_size=16)
+    whole = hashlib.sha256()
     for thing in things:
         _add(thing, whole, known)
     return whole.digest()
@@ -100,7 +100,7 @@ def _add_all(kind: str, parts: Sequence[Any], whole: Any, known: dict[int, bytes
 
 
 def _of_array(array: np.ndarray) -> bytes:
-    own = hashlib.blake2b(f"array {array.shape} {array.dtype};".encode(), digest_size=16)
+    own = hashlib.sha256(f"array {array.shape} {array.dtype};".encode())
     if array.ndim:
         for some in spans(len(array)):
             own.update(np.ascontiguousarray(array[some]).data)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -52,6 +52,19 @@ class WideMotion:
     torque: Floats
     flagged: BoolArray
     drive: DriveMotion | None
+    _away: dict[tuple[Any, ...], BoolArray] = field(default_factory=dict, repr=False)
+
+    def away(
+        self, dt: float, settings: SignalSettings, coupled: tuple[tuple[int, int], ...]
+    ) -> BoolArray:
+        """Samples (n, J) of `away_of_drives` by the settings, found once."""
+        beside = settings.reversal, settings.standstill_rad_s, settings.turning
+        key = (dt, *beside, settings.slow, coupled)
+        if key not in self._away:
+            self._away[key] = away_of_drives(
+                self.qd, dt, *beside, slow_rad_s=settings.slow, coupled=coupled
+            )
+        return self._away[key]
 
     @classmethod
     def of(
@@ -139,11 +152,10 @@ class Motion:
         core: tuple[float, float],
         wide: WideMotion,
         settings: SignalSettings,
-        coupled: Sequence[tuple[int, int]],
+        coupled: tuple[tuple[int, int], ...],
     ) -> Motion:
         """The samples from span[0] to before span[1] of `wide`. coupled : pairs of joints with a drive in common."""
-        beside = settings.reversal, settings.standstill_rad_s, settings.turning
-        away = away_of_drives(wide.qd, part.dt, *beside, slow_rad_s=settings.slow, coupled=coupled)
+        away = wide.away(part.dt, settings, coupled)
         kept = slice(span[0] - wide.low, span[1] - wide.low)
         states = wide.q[kept], wide.qd[kept], wide.qdd[kept], wide.torque[kept]
         drive = None if wide.drive is None else wide.drive.at(kept)
@@ -252,7 +264,7 @@ def filtered_motions(
     parts: list[Stretch],
     wide: Callable[[Stretch, int, int], WideMotion],
     settings: SignalSettings,
-    coupled: Sequence[tuple[int, int]],
+    coupled: tuple[tuple[int, int], ...],
     blocks: bool,
 ) -> Iterator[Motion]:
     """The motions of all stretches, block after block.

@@ -82,13 +82,17 @@ def prepare(
     Raises DataError for too few samples, times that do not increase, non-finite values, no torque, no motion.
     """
     name, recall = session.path.name, recall or Recall()
-    joint = _joint_channel(session, motor)
+    channels = (session.joint, session.motor)
+    joint = recall.of(partial(_joint_channel, session, motor), *channels, motor)
     settings = (settings or SignalSettings()).settled(1.0 / joint.dt)
     moved = _moved(session, joint, settings, blocks, recall)
     warnings = list(moved.warnings)
     motor_data, delay = None, None
     if motor and session.motor is not None:
-        motor_data = _motor(session, joint.origin, settings, name, warnings, recall)
+        motor_data, told = recall.of(
+            partial(_motor, session, joint.origin, settings, recall), *channels, settings.outlier_scale
+        )
+        warnings += told
         if joint.clock is not None:
             motor_data = (joint.clock.at(motor_data[0], joint.stamps), *motor_data[1:])
         springs = _stiffness(settings, session.joint_names) if joint.sensed else None
@@ -208,8 +212,8 @@ def _moved(
 ) -> _Moved:
     name, names = session.path.name, session.joint_names
     position, effort = session.joint.position, joint.effort
-    position_flags, crowded = _outliers(position, settings, recall)
-    effort_flags, also = _outliers(effort, settings, recall)
+    position_flags, crowded = outliers(position, settings.outlier_scale, recall)
+    effort_flags, also = outliers(effort, settings.outlier_scale, recall)
     seen = recall.of(partial(_seen, session.joint, joint.times, joint.clock), session.joint)
     kept, stuck = seen.held, frozen_flags(seen.torques, effort.shape)
     effort_flags = effort_flags | kept[:, None] | stuck
@@ -300,9 +304,8 @@ class _Seen:
     moving: tuple[str, ...]
 
 
-def _outliers(values: Floats, settings: SignalSettings, recall: Recall) -> tuple[BoolArray, list[int]]:
-    """Flags (n, k) and columns with too many of them: see `flag_outliers`."""
-    scale = settings.outlier_scale
+def outliers(values: Floats, scale: float, recall: Recall) -> tuple[BoolArray, list[int]]:
+    """`flag_outliers` of a channel (n, k), recalled."""
     return recall.of(partial(flag_outliers, values, scale), values, scale)
 
 
@@ -404,12 +407,12 @@ def _motor(
     session: Session,
     origin: int,
     settings: SignalSettings,
-    name: str,
-    warnings: list[str],
     recall: Recall,
-) -> tuple[Floats, Floats, BoolArray]:
-    """Times (m,) [s] on the joint channel's clock, torques (m, J) and outlier flags (m, J) of the motor channel."""
+) -> tuple[tuple[Floats, Floats, BoolArray], list[str]]:
+    """Times (m,) [s] on the joint channel's clock, torques (m, J) and outlier flags (m, J) of the motor channel; and
+    warnings."""
     assert session.motor is not None
+    name, warnings = session.path.name, list[str]()
     _check_finite(session.motor, name)
     if not session.motor.effort.shape[1]:
         raise DataError(f"{name}: /motor_states has no effort; record motor torques or choose Model 1")
@@ -426,7 +429,7 @@ def _motor(
         )
     sample_period(times, None, f"{name}: /motor_states")
     effort = session.motor.effort
-    flags, crowded = _outliers(effort, settings, recall)
+    flags, crowded = outliers(effort, settings.outlier_scale, recall)
     warnings += _jumping(name, "motor torque", session.joint_names, crowded)
     path_times = np.asarray((reference - origin) * 1e-9, dtype=np.float64)
     path = session.joint.position
@@ -436,7 +439,7 @@ def _motor(
     for joint in np.flatnonzero(flags.any(axis=0)):
         good = ~flags[:, joint]
         effort[~good, joint] = np.interp(times[~good], times[good], effort[good, joint])
-    return times, effort, flags
+    return (times, effort, flags), warnings
 
 
 def _jumping(name: str, what: str, joints: tuple[str, ...], columns: list[int]) -> list[str]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from ident.dynamics.parameters import Floats
 
@@ -25,13 +25,9 @@ def away_from_reversals(
 
     speed : (n, J) every `dt` seconds [rad/s].
     """
-    size = 2 * round(window_s / dt) + 1
-    lowest, highest = minimum_filter1d(speed, size, axis=0), maximum_filter1d(speed, size, axis=0)
-    away = np.asarray((lowest > standstill_rad_s) | (highest < -standstill_rad_s))
-    if turning_rad > 0.0:
-        away &= _path(speed, dt, standstill_rad_s) >= turning_rad
-    for joint, own in enumerate(speed.T):
-        away[:, joint] &= ~ringing(own, dt)
+    away = np.empty(speed.shape, dtype=bool)
+    for joint in range(speed.shape[1]):
+        _mark(np.ascontiguousarray(speed[:, joint]), dt, round(window_s / dt), standstill_rad_s, turning_rad, away[:, joint])
     return away
 
 
@@ -76,12 +72,32 @@ def turning_reach(window_s: float, standstill_rad_s: float, turning_rad: float) 
     return max(window_s + min(turning_rad / max(standstill_rad_s, 1e-4), _LONGEST_S), RINGING_S)
 
 
-def _path(speed: Floats, dt: float, standstill_rad_s: float) -> Floats:
-    """Path (n, J) since the joint last reversed or rested [rad]."""
-    way = np.where(np.abs(speed) > standstill_rad_s, np.sign(speed), 0.0)
-    turned = np.ones(speed.shape, dtype=bool)
-    turned[1:] = (way[1:] != way[:-1]) | (way[1:] == 0.0)
-    step = np.abs(speed) * dt
-    gone = np.cumsum(step, axis=0)
-    # `gone` only grows, so the largest one before a turn is the last.
-    return np.asarray(gone - np.maximum.accumulate(np.where(turned, gone - step, 0.0), axis=0))
+@njit(cache=True, nogil=True)
+def _mark(speed, dt, window, standstill_rad_s, turning_rad, away):  # type: ignore[no-untyped-def]
+    """`away_from_reversals` of the speed (n,) of one joint, to `away` (n,). window : samples on either side."""
+    count = len(speed)
+    gone, start = 0.0, 0.0
+    way, since, turn = 0, 0, -1
+    for k in range(count):
+        now = 0
+        if speed[k] > standstill_rad_s:
+            now = 1
+        elif speed[k] < -standstill_rad_s:
+            now = -1
+        step = abs(speed[k]) * dt
+        gone += step
+        if k == 0 or now == 0 or now != way:
+            # What the samples before within the window see ahead; those before a rest have seen its begin.
+            for before in range(max(k - window, 0) if now != 0 or way != 0 else k, k):
+                away[before] = False
+            start = max(start, gone - step)
+            way, since = now, k
+        # No sample is missing before the first one.
+        kept = since == 0 or k - since >= window
+        away[k] = now != 0 and kept and (turning_rad <= 0.0 or gone - start >= turning_rad)
+        if k > 0 and (np.signbit(speed[k]) != np.signbit(speed[k - 1])):
+            # No swing is known before the first reversal and after the last one.
+            if turn >= 0 and (k - turn) * dt < RINGING_S:
+                for before in range(turn, k):
+                    away[before] = False
+            turn = k

@@ -191,9 +191,20 @@ def _medians_around(values: Floats) -> Floats:
     """The largest of the medians of each block (m,) of `_BLOCK` values (n,) and of the neighbouring blocks."""
     whole = len(values) // _BLOCK * _BLOCK
     table = values[:whole].reshape(-1, _BLOCK)
-    medians = [np.median(table[some], axis=1) for some in spans(len(table))]
+    medians = [_medians(table[some]) for some in spans(len(table))]
     last = np.array([np.median(values[-_BLOCK:])])
     return np.asarray(maximum_filter1d(np.concatenate([*medians, last]), 3, mode="nearest"))
+
+
+@njit(cache=True, nogil=True)
+def _medians(table):  # type: ignore[no-untyped-def]
+    """Medians (m,) of the rows of (m, k)."""
+    rows, count = table.shape
+    found = np.empty(rows)
+    for row in range(rows):
+        ordered = np.sort(table[row])
+        found[row] = 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2])
+    return found
 
 
 @njit(cache=True, nogil=True)

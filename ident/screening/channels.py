@@ -9,7 +9,7 @@ import numpy as np
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats, joint_unit
-from ident.rows.content import content
+from ident.rows.content import Recall, content
 from ident.rows.data_quality import Jump, position_jumps, run_bounds
 from ident.rows.shared_rows import ROUNDED, SAME_ROWS, Cells, row_numbers, shared
 from ident.screening.doubts import Doubt, torques_of
@@ -31,8 +31,11 @@ _TURN = 0.02
 _COPIED_S, _COPIED, _CHANGES = 1.0, 0.1, 20
 
 
-def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
-    """Doubts about the channels of sessions with the joints of `chain`."""
+def check_channels(
+    sessions: Sequence[Session], chain: Chain, *, recall: Recall | None = None
+) -> list[Doubt]:
+    """Doubts about the channels of sessions with the joints of `chain`. recall : as for `prepare`."""
+    recall = recall or Recall()
     units = dict(zip(chain.joint_names, chain.torque_units, strict=True))
     found = [
         *check_unmeasured(chain),
@@ -45,8 +48,8 @@ def check_channels(sessions: Sequence[Session], chain: Chain) -> list[Doubt]:
         frozen = list(frozen_channels(session))
         named = {(doubt.channel, doubt.joints) for doubt in frozen}
         clipped = [doubt for doubt in saturated(session, units) if (doubt.channel, doubt.joints) not in named]
-        found += [*_clocks(session), *frozen, *_jumps(session, chain), *check_spikes(session, chain)]
-        found += [*clipped, *check_speeds(session)]
+        found += [*_clocks(session), *frozen, *_jumps(session, chain), *check_spikes(session, chain, recall)]
+        found += [*clipped, *check_speeds(session, recall)]
     return found
 
 

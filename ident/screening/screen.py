@@ -91,7 +91,7 @@ def _doubts(
     *,
     recall: Recall,
 ) -> tuple[Doubt, ...]:
-    doubts, beyond = check_channels(chosen, chain), check_limits(chosen, chain)
+    doubts, beyond = check_channels(chosen, chain, recall=recall), check_limits(chosen, chain)
     if any(doubt.certain for doubt in (*doubts, *beyond)):
         # A certain fault bends everything computed from it.
         return (*doubts, *beyond)

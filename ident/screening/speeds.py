@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ident.dynamics.parameters import Floats
+from ident.rows.content import Recall
 from ident.rows.data_quality import position_jumps
 from ident.rows.filters import median_step
 from ident.screening.doubts import LATE_S, MEND_TIME, MOVED, Doubt
@@ -27,10 +28,10 @@ _SURE = 5.0
 _SPEED_UNITS = {180.0 / np.pi: "deg/s for rad/s", 30.0 / np.pi: "revolutions per minute for rad/s"}
 
 
-def check_speeds(session: Session) -> Iterator[Doubt]:
+def check_speeds(session: Session, recall: Recall | None = None) -> Iterator[Doubt]:
     """Velocities against the differences of the positions."""
     joint, name = session.joint, session.path.name
-    blocks = _speeds(joint)
+    blocks = _speeds(joint, recall)
     if blocks is None:
         return
     inner, slope, change = blocks
@@ -98,7 +99,7 @@ def _common_factor(session: Session, factors: dict[int, float], wrong: dict[int,
     return Doubt("time", (), seen, looks, mend, _by_unit(common), name)
 
 
-def _speeds(joint: JointColumns) -> tuple[Floats, Floats, Floats] | None:
+def _speeds(joint: JointColumns, recall: Recall | None) -> tuple[Floats, Floats, Floats] | None:
     """Velocities, dq/dt and accelerations (m, J) by the velocities, means over blocks: the first two are exact there.
     None without velocities."""
     if not joint.velocity.shape[1] or len(joint) < 100:
@@ -120,7 +121,7 @@ def _speeds(joint: JointColumns) -> tuple[Floats, Floats, Floats] | None:
     # A jump or a wrong sample says nothing of the speed.
     behind = np.array([jump.behind for jump in position_jumps(joint)], dtype=np.int64)
     whole = np.diff(np.searchsorted(behind, places, side="right")) == 0
-    wrong = np.count_nonzero(spikes(joint.position)[places], axis=1)
+    wrong = np.count_nonzero(spikes(joint.position, recall)[places], axis=1)
     whole &= wrong[1:] + wrong[:-1] == 0
     return (inner[whole], slope[whole], change[whole]) if np.isfinite(inner).all() else None
 

@@ -8,43 +8,43 @@ import numpy as np
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats, joint_unit
-from ident.rows.content import Kept
+from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
-from ident.rows.timebase import BoolArray, flag_outliers
+from ident.rows.prepare import outliers
+from ident.rows.timebase import BoolArray
 from ident.screening.doubts import Doubt, torques_of
 from lwr_driver.session import JointColumns, Session
 from lwr_driver.session.spool import column
 
 _AROUND = 2
-# Latest channels whose spikes are known.
-_MOST_KNOWN = 64
-_known = Kept[BoolArray](_MOST_KNOWN)
 
 
-def spikes(values: Floats) -> BoolArray:
-    """Flags (n, k) of samples of positions or torques that no row uses, with the settings of every day."""
-    return _known.of(_flags, values)
+def spikes(values: Floats, recall: Recall | None = None) -> BoolArray:
+    """Flags (n, k) of samples of positions or torques that no row uses, with the settings of every day. recall : as for
+    `prepare`."""
+    return outliers(values, SignalSettings().outlier_scale, recall or Recall())[0]
 
 
-def _flags(values: Floats) -> BoolArray:
-    return flag_outliers(values, SignalSettings().outlier_scale)[0]
-
-
-def check_spikes(session: Session, chain: Chain) -> Iterator[Doubt]:
+def check_spikes(session: Session, chain: Chain, recall: Recall | None = None) -> Iterator[Doubt]:
     """Spikes of the positions, and those of the torques beyond all other torques of the recording."""
     joint, name = session.joint, session.path.name
     lengths, units = chain.prismatic.tolist(), list(chain.torque_units)
-    yield from position_spikes(_seconds(joint), joint.position, session.joint_names, lengths, name)
+    yield from position_spikes(_seconds(joint), joint.position, session.joint_names, lengths, name, recall)
     for channel, columns in torques_of(session):
-        yield from torque_spikes(_seconds(columns), columns.effort, columns.names, units, channel, name)
+        yield from torque_spikes(_seconds(columns), columns.effort, columns.names, units, channel, name, recall)
 
 
 def position_spikes(
-    times: Floats, values: Floats, names: Sequence[str], prismatic: Sequence[bool], session: str = ""
+    times: Floats,
+    values: Floats,
+    names: Sequence[str],
+    prismatic: Sequence[bool],
+    session: str = "",
+    recall: Recall | None = None,
 ) -> Iterator[Doubt]:
     """Doubts about positions (n, k) [rad or m] at times (n,) [s]."""
     units = [joint_unit("rad", prismatic=slides) for slides in prismatic]
-    yield from _doubts(times, values, names, units, "position", session, 0.0)
+    yield from _doubts(times, values, names, units, "position", session, 0.0, recall)
 
 
 def torque_spikes(
@@ -54,9 +54,10 @@ def torque_spikes(
     units: Sequence[str],
     channel: str,
     session: str = "",
+    recall: Recall | None = None,
 ) -> Iterator[Doubt]:
     """Doubts about torques (n, k) at times (n,) [s]; shocks of a motion may be spikes, but not beyond all others."""
-    yield from _doubts(times, values, names, units, channel, session, 1.0)
+    yield from _doubts(times, values, names, units, channel, session, 1.0, recall)
 
 
 def _doubts(
@@ -67,9 +68,10 @@ def _doubts(
     channel: str,
     session: str,
     least: float,
+    recall: Recall | None,
 ) -> Iterator[Doubt]:
     """least : size of a spike over the range of the other samples."""
-    flags = spikes(values)
+    flags = spikes(values, recall)
     for k in map(int, np.flatnonzero(flags.any(axis=0))):
         own, places = column(values, k), np.flatnonzero(flags[:, k])
         sizes = np.array([_size(own, int(place)) for place in places])

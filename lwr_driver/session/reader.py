@@ -394,11 +394,13 @@ class _JointTopic:
 
     def _check_finite(self, name: str, values: NDArray[np.float64], log_time: NDArray[np.int64]) -> None:
         wrong = [
-            np.argwhere(~np.isfinite(values[some])) + np.array([some.start, 0]) for some in spans(len(values))
+            np.argwhere(~finite) + np.array([some.start, 0])
+            for some in spans(len(values))
+            if not (finite := np.isfinite(values[some])).all()
         ]
         release(values)
-        bad = np.concatenate(wrong) if wrong else np.zeros((0, 2))
-        if len(bad):
+        if wrong:
+            bad = np.concatenate(wrong)
             row, column = bad[0].tolist()
             raise DataError(
                 f"{self.source}: {self.topic} at {stamp(int(log_time[row]))}: `{name}` of joint "
