@@ -341,12 +341,15 @@ class ModelStructure:
         sides: Sequence[Side] | None = None,
         columns: ArrayLike | None = None,
         drive: DriveMotion | None = None,
+        out: Floats | None = None,
     ) -> Floats:
         """Observation matrix of one session: (sides x n x N, C) float64, Fortran-ordered.
 
         q, qd, qdd : (N, n). payload : the mounted payload. sides : default all of the structure.
         columns : (C,) indices of columns (default all n_columns), e.g. those of a base set.
         drive : motion of the motors, for the columns of the drives; default that of the links.
+        out : (C, sides, n, N) to write into: zeros, or those of an earlier result for the same payload, sides and
+            columns.
         Row order: side, joint, sample (see the module).
         """
         position, speed, acceleration = check_states(self.chain, q, qd, qdd)
@@ -355,7 +358,11 @@ class ModelStructure:
         if wanted.ndim != 1 or np.any((wanted < 0) | (wanted >= self.n_columns)):
             raise ConfigurationError(f"columns must be a list of indices below {self.n_columns}")
         n, samples = self.chain.n, len(position)
-        out = np.zeros((len(wanted), len(chosen), n, samples))
+        shape = (len(wanted), len(chosen), n, samples)
+        if out is None:
+            out = np.zeros(shape)
+        elif out.shape != shape:
+            raise ConfigurationError(f"`out` has shape {out.shape}; expected {shape}")
         sources, entries = self._plan(wanted.tobytes(), payload, chosen)
         # Difference rows have no rigid part and are never preceded by other sides (side order).
         rigid_sides = [s for s, side in enumerate(chosen) if side != "difference"]

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from scipy.fft import next_fast_len
 from scipy.special import digamma, polygamma
 
 from fri.quantities import within
@@ -407,7 +407,7 @@ def effective_rows(problem: Problem, residuals: Sequence[Floats]) -> Floats:
             lags = min(span, max(64, span // 3))
             series = np.zeros(next_fast_len(span + lags, real=True))
             series[group.time_index - group.time_index[0]] = residuals[index]
-            correlation = irfft(np.abs(rfft(series)) ** 2, len(series))[:lags]
+            correlation = np.fft.irfft(np.abs(np.fft.rfft(series)) ** 2, len(series))[:lags]
             if len(correlation) > len(total):
                 total = np.pad(total, (0, len(correlation) - len(total)))
             total[: len(correlation)] += correlation

@@ -75,6 +75,7 @@ def binned_regressor(
     n, count = structure.chain.n, len(motion.q) // width * width
     size = max(width, _CHUNK // width * width)
     found = np.zeros((n, count // width, len(columns)))
+    memory = np.zeros((len(columns), 1, n, size))
     for first in range(0, count, size):
         some = slice(first, min(first + size, count))
         wide = structure.regressor(
@@ -85,6 +86,7 @@ def binned_regressor(
             sides=(side,),
             columns=columns,
             drive=None if motion.drive is None else motion.drive.at(some),
+            out=memory if some.stop - first == size else None,
         )
         _add_means(wide.T.reshape(len(columns), n, -1), width, found[:, first // width :])
     return found

@@ -405,8 +405,8 @@ class _Block:
         release(data.known)
         return found
 
-    def at(self, delay: float, known: Floats, total: Floats) -> tuple[Floats, Floats]:
-        """Columns (K, J, 4) and difference of the torques (K, J) for a delay."""
+    def at(self, delay: float, known: Floats) -> Floats:
+        """Filtered qdd, qd, its sign and the difference of the torques (K, J, 4) over the known samples."""
         data = self.data
         times = data.motor_times[self.inside] - delay
         dt = float(data.times[1] - data.times[0])
@@ -414,9 +414,10 @@ class _Block:
             interpolate_uniform(self.state, float(data.times[0]), dt, times), 3, axis=1
         )
         release(self.state)
-        signals = [qdd, qd, np.sign(qd), np.ones_like(qd), data.motor_torque[self.inside] - torque]
-        filtered = self.parallel.apply(np.stack(signals, axis=2) * known[:, :, None]) / total[:, :, None]
-        return filtered[:, :, :4], filtered[:, :, 4]
+        signals = np.empty((*qd.shape, 4))
+        for k, signal in enumerate((qdd, qd, np.sign(qd), data.motor_torque[self.inside] - torque)):
+            np.multiply(signal, known, out=signals[:, :, k])
+        return self.parallel.apply(signals)
 
 
 @dataclass(frozen=True)
@@ -490,12 +491,12 @@ class _Rows:
 
     def at(self, delay: float) -> tuple[Floats, Floats]:
         """Columns (K, J, 4) and difference of the torques (K, J) for a delay."""
-        total, place, found = np.where(self.known_rows, self.share, 1.0), 0, []
-        for block, known in zip(self.blocks, self.known, strict=True):
-            rows = slice(place, place + len(block.parallel.outputs))
-            found.append(block.at(delay, known, total[rows]))
-            place = rows.stop
-        return np.concatenate([columns for columns, _ in found]), np.concatenate([rest for _, rest in found])
+        total = np.where(self.known_rows, self.share, 1.0)
+        found = [block.at(delay, known) for block, known in zip(self.blocks, self.known, strict=True)]
+        columns = np.concatenate(found) / total[:, :, None]
+        rest = columns[:, :, 3].copy()
+        columns[:, :, 3] = self.share / total
+        return columns, rest
 
 
 def _misfit(parts: Sequence[_Rows], joints: Sequence[int], delay: float) -> float:

@@ -54,16 +54,12 @@ class WideMotion:
     drive: DriveMotion | None
     _away: dict[tuple[Any, ...], BoolArray] = field(default_factory=dict, repr=False)
 
-    def away(
-        self, dt: float, settings: SignalSettings, coupled: tuple[tuple[int, int], ...]
-    ) -> BoolArray:
+    def away(self, dt: float, settings: SignalSettings, coupled: tuple[tuple[int, int], ...]) -> BoolArray:
         """Samples (n, J) of `away_of_drives` by the settings, found once."""
         beside = settings.reversal, settings.standstill_rad_s, settings.turning
         key = (dt, *beside, settings.slow, coupled)
         if key not in self._away:
-            self._away[key] = away_of_drives(
-                self.qd, dt, *beside, slow_rad_s=settings.slow, coupled=coupled
-            )
+            self._away[key] = away_of_drives(self.qd, dt, *beside, slow_rad_s=settings.slow, coupled=coupled)
         return self._away[key]
 
     @classmethod
@@ -119,7 +115,9 @@ def recalled(
     make = partial(WideMotion.of, part, low, high, effort_flags, times, settings, stiffness)
     if high - low < part.count or 8 * effort_flags.shape[1] * part.count >= LEAST_BYTES:
         return make()
-    springs = () if stiffness is None else (*stiffness.tolist(), settings.encoder == "motor", settings.joint_delay)
+    springs = (
+        () if stiffness is None else (*stiffness.tolist(), settings.encoder == "motor", settings.joint_delay)
+    )
     return recall.of(make, *same, *springs, part.start, most=_MOST_MOTIONS)
 
 

@@ -234,6 +234,8 @@ def _filtered(
     times, torque = block_means(channel.times, factor), block_means(channel.torque * known, factor)
     share = block_means(known, factor)
     blocks = ParallelFilter(times, rows, settings.decimate, settings.attenuation_db).blocks()
+    step = max(1, _CHUNK // factor)
+    memory = np.zeros((len(columns), 1, joints, step * factor))
 
     def means(first: int, last: int) -> Floats:
         """Means of the regressor's columns (C n, last - first)."""
@@ -246,13 +248,13 @@ def _filtered(
             sides=(side,),
             columns=columns,
             drive=None if channel.drive is None else channel.drive.at(part),
+            out=memory if last - first == step else None,
         )
         # The regressor's memory runs (column, joint, sample): one product filters all columns.
         table = wide.T.reshape(len(columns), joints, -1)
         found: Floats = _known_means(table, np.ascontiguousarray(known[part].T), factor)
         return found
 
-    step = max(1, _CHUNK // factor)
     flat, low, done = np.zeros((len(columns) * joints, 0)), 0, 0
     while batch := list(islice(blocks, _BLOCKS)):
         # What the batch before needed of these means stays.

@@ -27,7 +27,14 @@ def away_from_reversals(
     """
     away = np.empty(speed.shape, dtype=bool)
     for joint in range(speed.shape[1]):
-        _mark(np.ascontiguousarray(speed[:, joint]), dt, round(window_s / dt), standstill_rad_s, turning_rad, away[:, joint])
+        _mark(
+            np.ascontiguousarray(speed[:, joint]),
+            dt,
+            round(window_s / dt),
+            standstill_rad_s,
+            turning_rad,
+            away[:, joint],
+        )
     return away
 
 

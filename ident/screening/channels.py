@@ -31,9 +31,7 @@ _TURN = 0.02
 _COPIED_S, _COPIED, _CHANGES = 1.0, 0.1, 20
 
 
-def check_channels(
-    sessions: Sequence[Session], chain: Chain, *, recall: Recall | None = None
-) -> list[Doubt]:
+def check_channels(sessions: Sequence[Session], chain: Chain, *, recall: Recall | None = None) -> list[Doubt]:
     """Doubts about the channels of sessions with the joints of `chain`. recall : as for `prepare`."""
     recall = recall or Recall()
     units = dict(zip(chain.joint_names, chain.torque_units, strict=True))

@@ -31,7 +31,9 @@ def check_spikes(session: Session, chain: Chain, recall: Recall | None = None) -
     lengths, units = chain.prismatic.tolist(), list(chain.torque_units)
     yield from position_spikes(_seconds(joint), joint.position, session.joint_names, lengths, name, recall)
     for channel, columns in torques_of(session):
-        yield from torque_spikes(_seconds(columns), columns.effort, columns.names, units, channel, name, recall)
+        yield from torque_spikes(
+            _seconds(columns), columns.effort, columns.names, units, channel, name, recall
+        )
 
 
 def position_spikes(
