@@ -21,7 +21,7 @@ summed first, so correlation between joints and sides is covered too, and then
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -33,9 +33,12 @@ from fri.quantities import within
 from ident.dynamics.parameters import Floats
 from ident.estimators.estimate import Covariance
 from ident.estimators.problem import Problem, RowGroup
+from lwr_driver.session.spool import spans
 
 _LONGEST = 4000
 _CHUNK = 8192
+# Samples transformed at a time, at most: 8 MB.
+_AT_ONCE = 2**20
 # Blocks enough for a variance of its own.
 _MANY_BLOCKS = 60
 # Longest lag of the stationary residuals [rows].
@@ -395,25 +398,31 @@ def bootstrap(problem: Problem, weights: Floats, block_s: float, draws: int, see
 
 def effective_rows(problem: Problem, residuals: Sequence[Floats]) -> Floats:
     """Number of independent rows of each class: n / (1 + 2 sum of autocorrelations) by Geyer's sequence."""
+    correlations = list(_autocorrelations(problem.groups, residuals))
     result = []
     for row_class in problem.classes:
-        total: Floats = np.zeros(1)
-        count = 0
-        for index in row_class.groups:
-            group = problem.groups[index]
-            if not len(group.target):
-                continue
-            span = int(group.time_index[-1] - group.time_index[0]) + 1
-            lags = min(span, max(64, span // 3))
-            series = np.zeros(next_fast_len(span + lags, real=True))
-            series[group.time_index - group.time_index[0]] = residuals[index]
-            correlation = np.fft.irfft(np.abs(np.fft.rfft(series)) ** 2, len(series))[:lags]
-            if len(correlation) > len(total):
-                total = np.pad(total, (0, len(correlation) - len(total)))
+        own = [correlations[index] for index in row_class.groups]
+        total = np.zeros(max(1, *map(len, own)))
+        for correlation in own:
             total[: len(correlation)] += correlation
-            count += len(group.target)
+        count = sum(len(residuals[index]) for index in row_class.groups)
         result.append(count / correlation_time(total) if count else 0.0)
     return np.array(result)
+
+
+def _autocorrelations(groups: Sequence[RowGroup], residuals: Sequence[Floats]) -> Iterator[Floats]:
+    """Sums of products of a group's residuals (m,) with those later by 0, 1, ... time indices, a third of its span, 64
+    at least; (lags,) of each group."""
+    reach = [int(np.ptp(group.time_index)) + 1 if len(group.target) else 0 for group in groups]
+    lags = [min(span, max(64, span // 3)) for span in reach]
+    size = next_fast_len(max(1, *map(sum, zip(reach, lags, strict=True))), real=True)
+    # As many groups at a time as take little memory.
+    for some in spans(len(groups), max(1, _AT_ONCE // size)):
+        series = np.zeros((len(groups[some]), size))
+        for row, group, residual in zip(series, groups[some], residuals[some], strict=True):
+            row[group.time_index - group.time_index[:1]] = residual
+        found = np.fft.irfft(np.abs(np.fft.rfft(series)) ** 2, size)
+        yield from (row[:count] for row, count in zip(found, lags[some], strict=True))
 
 
 def correlation_time(autocovariance: Floats) -> float:

@@ -51,6 +51,7 @@ from ident.rows.filters import (
 from ident.rows.prepared import BoolArray, Passage, PreparedSession, TorqueChannel
 from ident.rows.sample_clock import SampleClock, sample_clock
 from ident.rows.timebase import (
+    Stretch,
     flag_outliers,
     sample_period,
     stretches,
@@ -86,7 +87,8 @@ def prepare(
     joint = recall.of(partial(_joint_channel, session, motor), *channels, motor)
     settings = (settings or SignalSettings()).settled(1.0 / joint.dt)
     moved = _moved(session, joint, settings, blocks, recall)
-    warnings = list(moved.warnings)
+    sound = moved.sound
+    warnings = list(sound.warnings)
     motor_data, delay = None, None
     if motor and session.motor is not None:
         motor_data, told = recall.of(
@@ -113,11 +115,11 @@ def prepare(
     )
     warnings += advised if advise else ()
     counts = {
-        "lost": moved.lost,
-        **moved.flagged,
+        "lost": sound.lost,
+        **sound.flagged,
         "motor_torque_outliers": 0 if motor_data is None else int(motor_data[2].sum()),
-        "stretches": moved.stretches,
-        "resampled": int(moved.resampled),
+        "stretches": len(sound.parts),
+        "resampled": int(any(part.resampled for part in sound.parts)),
         "rows": sum(len(passage.rows) for passage in passages),
         "joint_rows_dropped": sum(int((~passage.joint_valid).sum()) for passage in passages),
         "motor_rows_dropped": sum(
@@ -137,7 +139,7 @@ def prepare(
         delay=delay,
         excitation_hz=moved.excitation_hz,
         cutoff_hz=settings.cutoff,
-        moving=moved.moving,
+        moving=sound.moving,
         counts=counts,
         warnings=tuple(warnings),
         uid=session.metadata.get("uid", ""),
@@ -186,30 +188,38 @@ def _joint_channel(session: Session, motor: bool) -> _JointChannel:
 
 
 @dataclass(frozen=True, eq=False)
-class _Moved:
-    """The filtered motions of a session and the times of its rows.
+class _Sound:
+    """The stretches of the joint channel without what is wrong with its samples.
 
-    excitation_hz : upper frequency of the motion. moving : names of the moving joints. lost, flagged : samples lost and
-    by flag. stretches : their number; resampled : whether any is. windows, grid : spans and times of the rows [s].
-    period_rows : rows in a period, if the periods are equal.
+    effort_flags : (N, n), torques that count as unknown. moving : names of the moving joints. lost, flagged : samples
+    lost and by flag.
     """
 
-    motions: list[Motion]
-    excitation_hz: float
+    parts: list[Stretch]
+    effort_flags: BoolArray
     moving: tuple[str, ...]
     lost: int
     flagged: dict[str, int]
-    stretches: int
-    resampled: bool
-    windows: list[tuple[float, float]]
-    grid: Floats
-    period_rows: int | None
     warnings: list[str]
 
 
-def _moved(
-    session: Session, joint: _JointChannel, settings: SignalSettings, blocks: bool, recall: Recall
-) -> _Moved:
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """The filtered motions of a session and the times of its rows.
+
+    excitation_hz : upper frequency of the motion. windows, grid : spans and times of the rows [s]. period_rows : rows
+    in a period, if the periods are equal.
+    """
+
+    sound: _Sound
+    motions: list[Motion]
+    excitation_hz: float
+    windows: list[tuple[float, float]]
+    grid: Floats
+    period_rows: int | None
+
+
+def _sound(session: Session, joint: _JointChannel, settings: SignalSettings, recall: Recall) -> _Sound:
     name, names = session.path.name, session.joint_names
     position, effort = session.joint.position, joint.effort
     position_flags, crowded = outliers(position, settings.outlier_scale, recall)
@@ -228,17 +238,9 @@ def _moved(
     parts, lost = stretches(joint.times, (position, effort), bad, joint.dt, settings.longest_bridge_s, jumps)
     if not parts:
         raise DataError(f"{name}: no uninterrupted stretch of samples is long enough; check the recording")
-    windows, periods = _windows(session, joint.times)
-    grid, period_rows = _row_grid(windows, periods, settings)
-    springs = _stiffness(settings, names) if joint.sensed else None
-    same = session.joint, settings.cutoff, settings.order, settings.outlier_scale, settings.longest_bridge_s
-    wide = partial(recalled, effort_flags, joint.times, settings, springs, recall, same)
-    motions = motions_shelved(filtered_motions(parts, wide, settings, settings.coupled_places(names), blocks))
-    release(position, effort)
-    longest = max(parts, key=lambda part: part.count)
-    return _Moved(
-        motions=motions,
-        excitation_hz=recall.of(partial(excitation_hz, motions, longest, joint.dt, settings.cutoff), *same),
+    return _Sound(
+        parts=parts,
+        effort_flags=effort_flags,
         moving=seen.moving,
         lost=lost,
         flagged={
@@ -250,16 +252,30 @@ def _moved(
             "position_frozen": int(unseen.sum()),
             "position_jumps": len(set(jumps)),
         },
-        stretches=len(parts),
-        resampled=any(part.resampled for part in parts),
-        windows=windows,
-        grid=grid,
-        period_rows=period_rows,
         warnings=[
             *_jumping(name, "position", names, crowded),
             *_jumping(name, "joint torque", names, also),
         ],
     )
+
+
+def _moved(
+    session: Session, joint: _JointChannel, settings: SignalSettings, blocks: bool, recall: Recall
+) -> _Moved:
+    names = session.joint_names
+    samples = session.joint, settings.outlier_scale, settings.longest_bridge_s
+    sound = recall.of(partial(_sound, session, joint, settings, recall), *samples)
+    windows, periods = _windows(session, joint.times)
+    grid, period_rows = _row_grid(windows, periods, settings)
+    springs = _stiffness(settings, names) if joint.sensed else None
+    same = *samples, settings.cutoff, settings.order
+    wide = partial(recalled, sound.effort_flags, joint.times, settings, springs, recall, same)
+    coupled = settings.coupled_places(names)
+    motions = motions_shelved(filtered_motions(sound.parts, wide, settings, coupled, blocks))
+    release(session.joint.position, joint.effort)
+    longest = max(sound.parts, key=lambda part: part.count)
+    excitation = recall.of(partial(excitation_hz, motions, longest, joint.dt, settings.cutoff), *same)
+    return _Moved(sound, motions, excitation, windows, grid, period_rows)
 
 
 def _doubts(delay: Delay, name: str) -> Iterator[str]:

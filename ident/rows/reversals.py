@@ -27,14 +27,8 @@ def away_from_reversals(
     """
     away = np.empty(speed.shape, dtype=bool)
     for joint in range(speed.shape[1]):
-        _mark(
-            np.ascontiguousarray(speed[:, joint]),
-            dt,
-            round(window_s / dt),
-            standstill_rad_s,
-            turning_rad,
-            away[:, joint],
-        )
+        own = np.ascontiguousarray(speed[:, joint])
+        _mark(own, dt, round(window_s / dt), standstill_rad_s, turning_rad, away[:, joint])
     return away
 
 
