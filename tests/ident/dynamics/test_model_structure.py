@@ -53,6 +53,18 @@ def test_models_1_and_3_have_joint_and_difference_rows():
     assert ModelStructure(lwr(), 3).regressor(q, qd, qdd) @ x == pytest.approx(motor - joint, abs=1e-10)
 
 
+def test_a_matrix_is_written_over_an_earlier_one_of_the_same_columns():
+    structure = ModelStructure(lwr(), 2, payloads=("load",))
+    memory = np.zeros((structure.n_columns, 2, 7, 5))
+    for seed in range(2):
+        q, qd, qdd = states(structure.chain, 5, seed)
+        found = structure.regressor(q, qd, qdd, payload="load", out=memory)
+        assert np.shares_memory(found, memory)
+        np.testing.assert_array_equal(found, structure.regressor(q, qd, qdd, payload="load"))
+    with pytest.raises(ConfigurationError, match="`out` has shape"):
+        structure.regressor(q, qd, qdd, payload="load", out=memory[:, :, :, :4])
+
+
 def test_a_payloads_columns_are_zero_where_it_is_absent():
     structure = ModelStructure(lwr(), 2, payloads=("load",))
     q, qd, qdd = states(structure.chain, 5)

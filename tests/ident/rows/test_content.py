@@ -13,9 +13,12 @@ import pytest
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import ModelStructure
+from ident.estimation.identify import IdentificationSettings, identify
 from ident.rows import signal_choice
 from ident.rows.content import Kept, Recall, content
+from ident.rows.filtered_motion import WideMotion
 from ident.rows.filters import SignalSettings
+from ident.rows.prepare import prepare
 from ident.rows.signal_choice import choose_signals
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session
@@ -163,3 +166,48 @@ def test_the_choice_of_equal_recordings_is_made_once_and_of_changed_ones_anew(
     ask(recorded, model=1)
     ask(recorded, columns=21)
     assert len(calls) == 9
+
+
+def counted(monkeypatch: pytest.MonkeyPatch, where: Any, name: str) -> list[dict[str, Any]]:
+    """The keyword arguments of the calls of a function of a module or class."""
+    calls: list[dict[str, Any]] = []
+    plain = getattr(where, name)
+
+    def call(*rest: Any, **options: Any) -> Any:
+        calls.append(options)
+        return plain(*rest, **options)
+
+    monkeypatch.setattr(where, name, call)
+    return calls
+
+
+def test_the_motion_of_elastic_joints_is_filtered_once_for_all_windows_beside_reversals(
+    recorded: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls, recall = counted(monkeypatch, WideMotion, "of"), Recall()
+    elastic = replace(SHORT, motor_delay_s=0.0, stiffness_nm_rad=(1e4,) * len(recorded.joint_names))
+    for settings in (elastic, replace(elastic, reversal_s=0.2), replace(elastic, encoder="link")):
+        prepare(recorded, settings, log=False, recall=recall)
+    assert len(calls) == 1
+    stiffer = replace(elastic, stiffness_nm_rad=(2e4,) * len(recorded.joint_names))
+    for number, settings in enumerate((replace(elastic, encoder="motor"), stiffer), start=2):
+        prepare(recorded, settings, log=False, recall=recall)
+        assert len(calls) == number
+
+
+def test_outliers_found_by_the_screening_are_those_of_the_rows(
+    recorded: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(screening, "_screened", Kept(8))
+    calls, recall = counted(monkeypatch, import_module("ident.rows.prepare"), "flag_outliers"), Recall()
+    screening.screen([recorded], chain(), recall=recall)
+    prepare(recorded, SHORT, log=False, recall=recall)
+    assert len(calls) == 3
+
+
+def test_the_delay_of_joint_torques_is_told_without_the_motor_torques(
+    recorded: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = counted(monkeypatch, import_module("ident.estimation.session_rows"), "prepare")
+    identify([recorded], chain(), IdentificationSettings(signals=SHORT, essential=None))
+    assert [call["motor"] for call in calls[:2]] == [True, False]
