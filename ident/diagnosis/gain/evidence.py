@@ -25,6 +25,7 @@ from ident.diagnosis.gain.products import (
     Products,
     Rows,
     Sums,
+    add_own_products,
     add_products,
     block_sums,
     inverse_of,
@@ -184,16 +185,20 @@ class Evidence:
         size = p + sum(width_of(rows) for rows in self.extra)
         self.gram, self.target = np.zeros((self.blocks, size, size)), np.zeros((self.blocks, size))
         self.gram[:, :p, :p], self.target[:, :p] = self._base_gram, self._base_target
+        wide: dict[Key, list[Floats]] = {}
+        places: dict[Key, list[NDArray[np.int64]]] = {}
         for here, rows in self._places():
             _, padded, products = self._known[id(rows)]
             self.gram[:, here, :p] = products.base
             self.gram[:, :p, here] = products.base.transpose(0, 2, 1)
             self.target[:, here] = products.target
-            for there, other in self._places():
-                if there.start <= here.start:
-                    cross = self._cross(padded, self._known[id(other)][1])
-                    self.gram[:, here, there] = cross
-                    self.gram[:, there, here] = cross.transpose(0, 2, 1)
+            for key, columns in padded.items():
+                wide.setdefault(key, []).append(columns)
+                places.setdefault(key, []).append(np.arange(here.start, here.stop))
+        # In a fixed order: the last digits of a sum depend on it.
+        for key in sorted(wide):
+            columns, on = np.concatenate(wide[key], axis=1), np.concatenate(places[key])
+            add_own_products(columns, self._starts[key[0]], self._weights[key], on, self.gram)
         self._scale = scale_of(np.einsum("bii->i", self.gram))
         self._part_gram, self._part_target = block_sums(self.parts, self.gram), self.parts @ self.target
         self.full = self._fit(self._part_gram.sum(axis=0), self._part_target.sum(axis=0))
@@ -323,7 +328,7 @@ class Evidence:
         for key, wide in columns.items():
             starts, weight = self._starts[key[0]], self._weights[key]
             add_products(wide, self._columns[key], starts, weight, self._acting[key], base)
-            add_products(wide, wide, starts, weight, places, own)
+            add_own_products(wide, starts, weight, places, own)
             add_products(wide, self._targets[key], starts, weight, places[:1], target)
         return Products(base, own, target[:, :, 0], self.parts)
 

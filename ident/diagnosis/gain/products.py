@@ -113,6 +113,29 @@ def add_products(one, other, starts, weight, places, out):  # type: ignore[no-un
                     total[i, j] = 0.0
 
 
+@njit(cache=True, nogil=True)
+def add_own_products(wide, starts, weight, places, out):  # type: ignore[no-untyped-def]
+    """Add the weighted products among (r, k) in each block to the `places` (k,) of (blocks, p, p)."""
+    width = wide.shape[1]
+    total = np.zeros((width, width))
+    for block in range(len(starts) - 1):
+        acts = False
+        for row in range(starts[block], starts[block + 1]):
+            for i in range(width):
+                value = weight * wide[row, i]
+                if value != 0.0:
+                    acts = True
+                    for j in range(i + 1):
+                        total[i, j] += value * wide[row, j]
+        if acts:
+            for i in range(width):
+                for j in range(i + 1):
+                    out[block, places[i], places[j]] += total[i, j]
+                    if i != j:
+                        out[block, places[j], places[i]] += total[i, j]
+                    total[i, j] = 0.0
+
+
 def block_sums(parts: Floats, values: Floats) -> Floats:
     """Sums (parts, k, l) of values (blocks, k, l) over the blocks of each part."""
     return (parts @ values.reshape(len(values), -1)).reshape(len(parts), *values.shape[1:])
