@@ -190,7 +190,7 @@ class PhysicallyConsistent:
             return self._entropic(scale, quadratic, target)
         prior = self.prior
         root = np.zeros((prior.bodies.size, quadratic.shape[1]))
-        hessian = prior.hessian(self.metric)
+        hessian = self._hessian
         for number, places in enumerate(prior.bodies):
             here = slice(number * _BODY, (number + 1) * _BODY)
             root[here, places] = np.linalg.cholesky(hessian[np.ix_(places, places)] / scale).T
@@ -243,6 +243,10 @@ class PhysicallyConsistent:
             cones = [clarabel.NonnegativeConeT(count)] if count else []
             cones += [clarabel.PSDTriangleConeT(4)] * int(used[signs:].sum())
             x = _conic(curvature, np.zeros(len(x)), rows[chosen], left[chosen], cones)
+
+    @cached_property
+    def _hessian(self) -> Floats:
+        return self.prior.hessian(self.metric)
 
     @cached_property
     def _constraints(self) -> tuple[Floats, Floats]:

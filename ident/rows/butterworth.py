@@ -6,6 +6,8 @@ equal those of `butter` with `sosfiltfilt` to the last bit, tested against them.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -87,8 +89,14 @@ def spectrum(signal: Floats, dt: float, segment: int) -> tuple[Floats, Floats]:
     time = np.arange(segment) - 0.5 * (segment - 1)
     mean = parts.mean(axis=1, keepdims=True)
     slope = (parts @ time)[:, np.newaxis] / (time @ time)
-    angle = 2.0 * np.pi * np.arange(segment) / segment
-    window = np.array(_WINDOW) * (1.0, -1.0, 1.0, -1.0) @ np.cos(np.arange(4)[:, np.newaxis] * angle)
-    power: Floats = (np.abs(np.fft.rfft((parts - mean - slope * time) * window)) ** 2).mean(axis=0)
+    power: Floats = (np.abs(np.fft.rfft((parts - mean - slope * time) * _window(segment))) ** 2).mean(axis=0)
     power[1 : len(power) - (segment % 2 == 0)] *= 2.0
     return np.asarray(np.fft.rfftfreq(segment, dt), dtype=np.float64), power
+
+
+@lru_cache(maxsize=4)
+def _window(segment: int) -> Floats:
+    """The window (segment,), the same for all joints."""
+    angle = 2.0 * np.pi * np.arange(segment) / segment
+    window = np.array(_WINDOW) * (1.0, -1.0, 1.0, -1.0) @ np.cos(np.arange(4)[:, np.newaxis] * angle)
+    return np.asarray(window, dtype=np.float64)

@@ -100,6 +100,11 @@ class WideMotion:
         return cls(low, q, qd, qdd, torque, flagged, drive)
 
 
+def short(samples: int, joints: int) -> bool:
+    """Whether arrays of all samples of all joints stay in memory: what is recalled of a longer session fills it."""
+    return 8 * joints * samples < LEAST_BYTES
+
+
 def recalled(
     effort_flags: BoolArray,
     times: Floats,
@@ -113,7 +118,7 @@ def recalled(
 ) -> WideMotion:
     """`WideMotion.of`, recalled for a short stretch. same : what the motion of a session depends on."""
     make = partial(WideMotion.of, part, low, high, effort_flags, times, settings, stiffness)
-    if high - low < part.count or 8 * effort_flags.shape[1] * part.count >= LEAST_BYTES:
+    if high - low < part.count or not short(part.count, effort_flags.shape[1]):
         return make()
     springs = (
         () if stiffness is None else (*stiffness.tolist(), settings.encoder == "motor", settings.joint_delay)

@@ -37,6 +37,7 @@ from ident.rows.filtered_motion import (
     filtered_motions,
     motions_shelved,
     recalled,
+    short,
 )
 from ident.rows.filters import (
     ParallelFilter,
@@ -84,14 +85,15 @@ def prepare(
     """
     name, recall = session.path.name, recall or Recall()
     channels = (session.joint, session.motor)
-    joint = recall.of(partial(_joint_channel, session, motor), *channels, motor)
+    own = recall if short(len(session.joint), len(session.joint_names)) else Recall()
+    joint = own.of(partial(_joint_channel, session, motor), *channels, motor)
     settings = (settings or SignalSettings()).settled(1.0 / joint.dt)
     moved = _moved(session, joint, settings, blocks, recall)
     sound = moved.sound
     warnings = list(sound.warnings)
     motor_data, delay = None, None
     if motor and session.motor is not None:
-        motor_data, told = recall.of(
+        motor_data, told = own.of(
             partial(_motor, session, joint.origin, settings, recall), *channels, settings.outlier_scale
         )
         warnings += told
@@ -264,7 +266,8 @@ def _moved(
 ) -> _Moved:
     names = session.joint_names
     samples = session.joint, settings.outlier_scale, settings.longest_bridge_s
-    sound = recall.of(partial(_sound, session, joint, settings, recall), *samples)
+    own = recall if short(len(session.joint), len(names)) else Recall()
+    sound = own.of(partial(_sound, session, joint, settings, recall), *samples)
     windows, periods = _windows(session, joint.times)
     grid, period_rows = _row_grid(windows, periods, settings)
     springs = _stiffness(settings, names) if joint.sensed else None

@@ -211,3 +211,14 @@ def test_the_delay_of_joint_torques_is_told_without_the_motor_torques(
     calls = counted(monkeypatch, import_module("ident.estimation.session_rows"), "prepare")
     identify([recorded], chain(), IdentificationSettings(signals=SHORT, essential=None))
     assert [call["motor"] for call in calls[:2]] == [True, False]
+
+
+@pytest.mark.parametrize(("least_bytes", "times"), [(4 * 2**20, 1), (0, 2)])
+def test_arrays_of_a_long_session_are_not_recalled(
+    recorded: Session, monkeypatch: pytest.MonkeyPatch, least_bytes: int, times: int
+) -> None:
+    monkeypatch.setattr(import_module("ident.rows.filtered_motion"), "LEAST_BYTES", least_bytes)
+    calls, recall = counted(monkeypatch, import_module("ident.rows.prepare"), "_sound"), Recall()
+    for reversal_s in (0.05, 0.2):
+        prepare(recorded, replace(SHORT, reversal_s=reversal_s), log=False, recall=recall)
+    assert len(calls) == times
