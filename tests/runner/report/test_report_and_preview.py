@@ -34,6 +34,7 @@ from runner.report.markup import MOST_PERCENT
 from runner.report.page import write_report
 from runner.report.tables import better_than_published
 from runner.report.verdicts import headline, verdicts
+from runner.scene import start_server, stop_server
 from tests.runner.report.view_rig import CLIPPED, CONTRAST, NARROW, WIDE, Seen, flaws, opened
 
 pytestmark = pytest.mark.slow
@@ -451,6 +452,16 @@ def test_the_preview_shows_the_arm_and_the_limits(preview: Path, chrome: Browser
             assert box["height"] > 150
         assert seen.errors == []
         assert seen.external == []
+
+
+def test_the_scene_is_lit_without_a_panorama() -> None:
+    server = start_server()
+    try:
+        sent = [message for _, message in server.get_scene_serializer()._messages]
+    finally:
+        stop_server(server)
+    (panorama,) = [one for one in sent if one["type"] == "EnvironmentMapMessage"]
+    assert panorama["hdri_data"] is None
 
 
 def colours(page: Page) -> int:
