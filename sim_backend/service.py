@@ -338,7 +338,7 @@ class Service:
 
     @property
     def _patience_s(self) -> float:
-        return _RESEND_S if self._absent else _RESEND_HEARD_S
+        return _RESEND_S if self._absent or self._heard_s is None else _RESEND_HEARD_S
 
     def _left(self) -> bool:
         """Lock step: whether the client has left, told once: its port is closed, or it is silent for too long."""

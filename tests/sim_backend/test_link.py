@@ -292,3 +292,13 @@ def test_shipped_scenarios_run(name, power):
         status = pendant.status()
         assert (status["power"], status["state"]) == (power, "CMD")
         assert status["monitor"]["violations"] == 0
+
+
+def test_a_first_packet_that_a_closed_port_refused_soon_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sim_backend.service._RESEND_HEARD_S", 3600.0)
+    port = free_port("127.0.0.1")
+    with emulator(port) as pendant:
+        # Answered only after the refusal was read.
+        pendant.status()
+        with Pc(port) as pc:
+            assert pc.run(1, silence_s=20.0) == 1
