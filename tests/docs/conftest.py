@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,9 @@ from click.testing import CliRunner
 import runner.experiment
 from lwr_driver.session.trace import TraceImport, import_trace
 from runner.cli import main
+from runner.report.figure import Figure, MatrixFigure
+from runner.report.figures import every_figure
+from runner.report.folder import ResultFolder
 
 LOAD = {"name": "paper_load", "mass": 3.34, "com": [0.0, -0.066, 0.144]}
 SHORT: dict[str, Any] = {
@@ -76,3 +80,18 @@ def workplace(laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         return place
 
     return go
+
+
+@pytest.fixture
+def few_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a paper only one figure of each kind: tests/runner/report draws them all."""
+
+    def few(results: ResultFolder, **options: str) -> list[Figure | MatrixFigure]:
+        kinds: dict[str, Figure | MatrixFigure] = {}
+        for one in every_figure(results, **options):
+            kind = re.match(r"residual-\w+|torque-logged|\w+", one.name)
+            assert kind is not None
+            kinds.setdefault(kind[0], one)
+        return list(kinds.values())
+
+    monkeypatch.setattr("runner.report.paper_folder.every_figure", few)

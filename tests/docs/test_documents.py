@@ -49,16 +49,13 @@ def clear_outputs(document: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("document", WITH_COMMANDS, ids=str)
+@pytest.mark.usefixtures("few_figures")
 def test_commands_do_what_they_say(document: Path, workplace: Callable[[], Path]) -> None:
     place = workplace()
     if document.name == "quick_start.md":
         (place / "my_lab.yaml").write_text(blocks(document, "yaml")[0].text)
     elif document.name == "identify_settings.md":
         (place / "my_settings.yaml").write_text(blocks(document, "yaml")[0].text)
-    elif document.name == "paper.md":
-        # One session has every kind of figure.
-        for name in ("unloaded", "unseen"):
-            (place / "results" / f"{name}.mcap").unlink()
     elif document.name == "session_log.md":
         # A log that has no motor torques yet, and the controller's recording of the same motion.
         (place / "other" / "loaded.trace.csv").rename(place / "loaded.trace.csv")

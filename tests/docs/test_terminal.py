@@ -532,6 +532,7 @@ def test_json_of_recover_attach_and_export(workplace: Callable[[], Path]) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_figures")
 def test_options_of_commands_for_logs(workplace: Callable[[], Path]) -> None:
     place = workplace()
     (place / "other" / "loaded.plain.mcap").rename(place / "bare.mcap")

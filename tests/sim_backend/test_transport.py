@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import socket
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +81,7 @@ def test_drivers_may_follow_each_other_and_notice_the_end_of_the_emulator() -> N
             with Driver(arm(), link, host=emulator.host) as driver:
                 driver.connect()
                 assert driver.monitor(10).cycles == 10
-        with Driver(arm(), link, host=emulator.host) as driver:
+        with Driver(arm(), replace(link, lock_step_patience_s=1.0), host=emulator.host) as driver:
             driver.connect()
             emulator.pendant.shutdown()
             with pytest.raises(NetworkError, match=r"the loop in process \d+ ended"):
