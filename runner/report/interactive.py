@@ -46,7 +46,7 @@ def plotly_script() -> str:
     return str(get_plotlyjs())
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)  # plotly and the charts of a page
 def zipped(text: str) -> str:
     """A text as base64 of gzip; the page's script opens it. The same bytes for the same text."""
     # The highest level takes half as long again for half a per cent.
