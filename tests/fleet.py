@@ -15,7 +15,7 @@ from lwr_driver.session import SessionWriter, session_metadata
 
 Floats = NDArray[np.float64]
 START = date(2026, 3, 1)
-RATE_HZ, PERIOD_S = 200.0, 12.0
+PERIOD_S = 12.0
 # Standard deviation of friction between arms and from day to day, as shares of it.
 _MADE, _DAILY = 0.05, 0.03
 
@@ -37,12 +37,13 @@ class Event:
 
 @dataclass(frozen=True)
 class Fleet:
-    """A simulated fleet, recorded into `folder`/arm/day."""
+    """A simulated fleet, recorded into `folder`/arm/day with `rate_hz` samples a second."""
 
     truth: DynamicModel
     folder: Path
     events: tuple[Event, ...] = ()
     seed: int = 1
+    rate_hz: float = 200.0
 
     def record(self, arm: int, day: int) -> list[Path]:
         """Write the logs of an arm's day: without a payload, and with one after such an event."""
@@ -77,7 +78,7 @@ class Fleet:
     def _log(self, path: Path, model: DynamicModel, payload: str, seed: Sequence[int]) -> Path:
         random = np.random.default_rng(seed)
         chain = model.structure.chain
-        time, q, qd, qdd = _motion(random, chain.n)
+        time, q, qd, qdd = _motion(random, chain.n, self.rate_hz)
         mounted = None if payload == "none" else payload
         stamps = 1_700_000_000_000_000_000 + np.rint(time * 1e9).astype(np.int64)
         metadata = session_metadata(robot=model.robot, payload=payload, uid="-".join(map(str, seed)))
@@ -93,9 +94,11 @@ class Fleet:
         return path
 
 
-def _motion(random: np.random.Generator, n: int) -> tuple[Floats, Floats, Floats, Floats]:
+def _motion(
+    random: np.random.Generator, n: int, rate_hz: float
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Times (N,), and q, qd, qdd (N, n) of a random Fourier series."""
-    time = np.arange(round((PERIOD_S + 2.0) * RATE_HZ)) / RATE_HZ
+    time = np.arange(round((PERIOD_S + 2.0) * rate_hz)) / rate_hz
     k = np.arange(1, 6)
     phase = 2 * np.pi / PERIOD_S * time[:, None, None] * k
     w = 2 * np.pi / PERIOD_S * k

@@ -41,7 +41,7 @@ EVENTS = (
 
 @pytest.fixture(scope="module")
 def fleet(truth_model: DynamicModel, tmp_path_factory: pytest.TempPathFactory) -> Fleet:  # noqa: F811
-    fleet = Fleet(truth_model, tmp_path_factory.mktemp("fleet") / "logs", EVENTS)
+    fleet = Fleet(truth_model, tmp_path_factory.mktemp("fleet") / "logs", EVENTS, rate_hz=100.0)
     for arm in range(ARMS):
         for day in range(DAYS - 1):
             fleet.record(arm, day)
@@ -183,7 +183,7 @@ def test_days_are_diagnosed_against_the_healthy_days_before(
     truth_model: DynamicModel,  # noqa: F811
     tmp_path: Path,
 ) -> None:
-    fleet = Fleet(truth_model, tmp_path / "logs", (Event(0, "wear", 3, joint=2, size=0.5),))
+    fleet = Fleet(truth_model, tmp_path / "logs", (Event(0, "wear", 3, joint=2, size=0.5),), rate_hz=100.0)
     for day in range(4):
         fleet.record(0, day)
     folder = tmp_path / "store"
