@@ -61,7 +61,9 @@ def start_server(port: int = 0, *, host: str = "127.0.0.1") -> Any:
     server.scene.configure_default_lights(True, cast_shadow=False)
     # The light of viser's panorama costs a computer without a graphics card seconds before the first picture.
     server.scene.configure_environment_map(None)
-    server.scene.add_light_hemisphere("/sky", sky_color=(235, 240, 245), ground_color=(150, 145, 140), intensity=2.2)
+    server.scene.add_light_hemisphere(
+        "/sky", sky_color=(235, 240, 245), ground_color=(150, 145, 140), intensity=2.2
+    )
     server.gui.add_html(_widgets())
     server.initial_camera.position = (1.45, -1.35, 1.05)
     server.initial_camera.look_at = (0.0, 0.0, 0.45)

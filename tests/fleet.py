@@ -94,9 +94,7 @@ class Fleet:
         return path
 
 
-def _motion(
-    random: np.random.Generator, n: int, rate_hz: float
-) -> tuple[Floats, Floats, Floats, Floats]:
+def _motion(random: np.random.Generator, n: int, rate_hz: float) -> tuple[Floats, Floats, Floats, Floats]:
     """Times (N,), and q, qd, qdd (N, n) of a random Fourier series."""
     time = np.arange(round((PERIOD_S + 2.0) * rate_hz)) / rate_hz
     k = np.arange(1, 6)
