@@ -27,7 +27,8 @@ PROBLEM = {
     "name": "second",
     "motion": {"period_s": 6.0, "harmonics": 3},
     "objective": {"criterion": "mean_rsd"},
-    "search": {"starts": 1, "hops": 0},
+    # The first seed whose motion passes the preflight.
+    "search": {"starts": 1, "hops": 0, "seed": 4},
 }
 
 
