@@ -19,7 +19,7 @@ from lwr_driver.contact import ContactSettings, ContactWatch, ExpectedArm
 from lwr_driver.control import Control, Job, Mode, Result, Text, Word
 from lwr_driver.loop import Loop, LoopSettings
 from lwr_driver.motion import move_to
-from lwr_driver.ring import Ring
+from lwr_driver.ring import ROW, Ring
 from sim_backend import service as service_module
 from sim_backend.configuration import load_configuration
 from sim_backend.service import Service
@@ -266,7 +266,7 @@ def test_many_cycles_at_once_are_the_single_cycles(
             result = _drive(pair, case)
             assert result is case.ends, pair.control.text(Text.REASON)
             assert pair.blocks >= case.least if many else pair.blocks == 0
-            found.append((np.concatenate(pair.rows), pair.state()))
+            found.append((np.concatenate(pair.rows, dtype=ROW), pair.state()))
         finally:
             pair.close()
     (rows, state), (many_rows, many_state) = found
