@@ -455,9 +455,9 @@ def preview(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def previewed(preview: Path, chrome: Browser) -> Iterator[Seen]:
-    # A low window: without a graphics card each pixel of the scene costs time.
+    # Not kept open: it moves all the time. A low window: without a graphics card each pixel costs time.
     with opened(chrome, preview, (WIDE[0], 300)) as seen:
         yield seen
 
