@@ -5,9 +5,9 @@ milliradians under the weight of a stretched arm: the lever of gravity is off by
 to stand where the encoders say. With the joint torque measured, both are known.
 
 Both models hold the same number of parameters. The log of the ratio of their errors in a block of held-back rows, the
-mean over joints and sides, is one sample of a t test; motor torques and joint torques are tested apart too, for a side
-that the twist makes worse says that it stands for something else, such as the lag of a sensor. Where the stiffness is
-the usual one of such joints, the error has to be least at a twist of about its size, not at the smallest tried.
+mean over joints and sides, is one sample of a t test. Motor torques and joint torques are tested apart too: what makes
+one side better and the other worse is no twist. Where the stiffness is the usual one of such joints, the error has to
+be least at a twist of about its size, not at the smallest tried.
 """
 
 from __future__ import annotations
