@@ -51,7 +51,7 @@ def bins(values: Floats, width: int) -> Floats:
     if width == 1:
         return values
     count = len(values) // width
-    return values[: count * width].reshape(count, width, -1).mean(axis=1)
+    return values[: count * width].reshape(count, width, *values.shape[1:]).mean(axis=1)
 
 
 class Motion(NamedTuple):

@@ -551,7 +551,7 @@ def _holds(recording: SessionRecord, stretch: RecordStretch, side: str) -> bool:
 def _whole(flags: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
     """Whether all `width` samples of a bin are set, (m, n) of (N, n)."""
     count = len(flags) // width
-    return np.asarray(flags[: count * width].reshape(count, width, -1).all(axis=1))
+    return np.asarray(flags[: count * width].reshape(count, width, *flags.shape[1:]).all(axis=1))
 
 
 def _guarded(moves: NDArray[np.bool_], rows: int) -> NDArray[np.bool_]:

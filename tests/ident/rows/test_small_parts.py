@@ -677,3 +677,7 @@ def test_a_commanded_motion_that_jumps_is_no_motion() -> None:
     position[1500:, 2] -= 2.0 * np.pi
     jumping = replace(session, command=replace(session.command, position=position))
     assert commanded(jumping, prepare(jumping, advise=False)) is None
+
+
+def test_too_few_samples_for_a_mean_are_none():
+    assert bins(np.ones((3, 2)), 8).shape == (0, 2)
