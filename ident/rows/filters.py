@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import prod
 from typing import Annotated, Literal
 
 import numpy as np
@@ -316,7 +317,8 @@ def resampled(times: Floats, values: Floats, wanted: Floats) -> Floats:
 def block_means(values: NDArray[np.generic], factor: int) -> Floats:
     """Means (m // factor, ...) of `factor` neighbours in (m, ...); a remainder at the end is left out."""
     count = len(values) // factor
-    grouped = np.asarray(values[: count * factor], dtype=np.float64).reshape(count, factor, -1)
+    used = np.asarray(values[: count * factor], dtype=np.float64)
+    grouped = used.reshape(count, factor, prod(values.shape[1:]))
     means = np.einsum("ijk->ik", grouped) / factor
     return means.reshape(count, *values.shape[1:])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -679,5 +680,6 @@ def test_a_commanded_motion_that_jumps_is_no_motion() -> None:
     assert commanded(jumping, prepare(jumping, advise=False)) is None
 
 
-def test_too_few_samples_for_a_mean_are_none():
-    assert bins(np.ones((3, 2)), 8).shape == (0, 2)
+@pytest.mark.parametrize("means", [bins, block_means])
+def test_too_few_samples_for_a_mean_are_none(means: Callable[[np.ndarray, int], np.ndarray]):
+    assert means(np.ones((3, 2)), 8).shape == (0, 2)
