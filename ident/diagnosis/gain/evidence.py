@@ -44,6 +44,10 @@ from lwr_driver.session.spool import Arena
 # Least share of a column's power left by base parameters without the prior, where the prior is a drawing.
 _OWN_SHARE = 3e-3
 
+# Share of the information on an accepted column that holds it at its value where a part of the motion is held back:
+# what a few moments alone tell has no value without them, and one from their edges would be all error there.
+_KEPT = 0.01
+
 # A fall of the chi-square up to this is no evidence, whatever its value on the held-back parts.
 _NO_EVIDENCE = 12.0
 
@@ -208,12 +212,16 @@ class Evidence:
 
     @property
     def _held(self) -> tuple[Fit, Floats]:
-        """Fits (parts, ...) without each part of the motion, and the products (parts, P) of the columns with what they
-        leave of its torques."""
+        """Fits (parts, ...) without each part of the motion, the further columns held near their values, see `_KEPT`,
+        and the products (parts, P) of the columns with what they leave of its torques."""
         if self._kept_held is None:
             gram, target = self._part_gram, self._part_target
+            variances = np.diag(self.full.inverse)
+            # A column of zeros has none, and nothing to keep.
+            pulls = np.where(variances > 0.0, _KEPT / np.where(variances > 0.0, variances, 1.0), 0.0)
+            pulls[: self.base_count] = 0.0
             fits = [
-                self._fit(g, t)
+                self._fit(g, t, pulls=pulls, towards=self.full.values)
                 for g, t in zip(gram.sum(axis=0) - gram, target.sum(axis=0) - target, strict=True)
             ]
             held = Fit(np.array([fit.values for fit in fits]), np.array([fit.inverse for fit in fits]))
@@ -235,13 +243,21 @@ class Evidence:
         return known and not lacking_bodies(self.nominal.structure.chain)
 
     def _fit(
-        self, gram: Floats, target: Floats, *, with_prior: bool = True, pulls: Floats | None = None
+        self,
+        gram: Floats,
+        target: Floats,
+        *,
+        with_prior: bool = True,
+        pulls: Floats | None = None,
+        towards: Floats | None = None,
     ) -> Fit:
-        """Values from sums of products, `with_prior` if there is one; pulls : (P,) precision of columns around zero."""
+        """Values from sums of products, `with_prior` if there is one; pulls : (P,) precision of columns around the
+        values `towards` (P,), default zero."""
         s = self._scale
         gram, target = gram.copy(), target.copy()
         if pulls is not None:
             gram[np.diag_indices_from(gram)] += pulls
+            target += 0.0 if towards is None else pulls * towards
         if self.prior is not None and with_prior:
             p = self.base_count
             gram[:p, :p] += self.prior[0]

@@ -199,7 +199,8 @@ def _findings(
     if losses:
         found.append(loss_finding(losses[0]))
     found += limit_findings(nominal.recordings, found)
-    doubts = [*claimed.doubts, *(f for f, is_one in zip(named, is_told, strict=True) if not is_one), *refuted]
+    doubts = [*claimed.doubts, *(f for f, is_one in zip(named, is_told, strict=True) if not is_one)]
+    doubts += [*state.hardly, *refuted]
     places = {(f.cause, f.joints) for f in found}
     doubts = [d for d in doubts if (d.cause, d.joints) not in places]
     return in_order(sorted(found, key=lambda f: -f.gain), evidence.floor), doubts

@@ -73,7 +73,7 @@ def in_time(task: Task, state: State) -> State:
         amounts = {cause: value for cause, (value, _) in rest.items()}
         if max(map(abs, amounts.values())) < _IN_PLACE * task.settings.delay_tolerance_s:
             break
-    timing: list[Finding] = []
+    timing, hardly = list[Finding](), list[Finding]()
     notes: dict[str, str] = {}
     after = State(bench, selection, baseline=baseline, left_out=tuple(doubtful))
     for claim in late:
@@ -87,6 +87,7 @@ def in_time(task: Task, state: State) -> State:
             if believable(finding.grounds):
                 timing.append(finding)
             else:
+                hardly.append(finding)
                 notes[_channel(claim)] = _corrected_delay(claim, finding)
     return replace(
         after,
@@ -94,6 +95,7 @@ def in_time(task: Task, state: State) -> State:
         timing=tuple(timing),
         notes=tuple(notes.values()),
         corrected=tuple(notes),
+        hardly=tuple(hardly),
     )
 
 

@@ -114,14 +114,15 @@ class State:
     """A diagnosis in progress.
 
     timing : findings of late channels, already shifted on the bench. corrected : channels shifted as well whose delay
-    is no finding, of which a note tells. loads : of payloads of another mass. baseline : before the shift.
-    left_out : causes dropped from the candidates.
+    is no finding, of which a note tells. hardly : findings hardly believed of some of these. loads : of payloads of
+    another mass. baseline : before the shift. left_out : causes dropped from the candidates.
     """
 
     bench: DiagnosisBench
     selection: Selection
     timing: tuple[Finding, ...] = ()
     corrected: tuple[str, ...] = ()
+    hardly: tuple[Finding, ...] = ()
     loads: tuple[Finding, ...] = ()
     baseline: Baseline | None = None
     notes: tuple[str, ...] = ()

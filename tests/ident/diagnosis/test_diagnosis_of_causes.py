@@ -237,6 +237,17 @@ def test_a_delay_that_slow_rows_contradict_is_known_no_better_than_their_differe
     assert late.evidence.p_value == plain.evidence.p_value
 
 
+def test_a_late_channel_hardly_believed_is_a_doubted_name_beside_its_note(
+    make: Make, chain: Chain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = importlib.import_module("ident.diagnosis.verdict.late_channels")
+    monkeypatch.setattr(module, "believable", lambda _: False)
+    found = diagnose(pair(make, late_motor), chain)
+    assert found.claims == ()
+    assert [one.cause for one in found.doubted] == ["motor_torque_delay"]
+    assert any("the evidence is too small for a finding" in note for note in found.notes)
+
+
 def test_gain_of_a_late_channel_counts_from_before_it_was_put_in_time(make: Make, chain: Chain) -> None:
     first, second = pair(make, late_motor)
     found = diagnose([first], chain, test=[second])
