@@ -213,13 +213,14 @@ class Dictionary:
         )
         self._kept: dict[tuple[str, int], list[_Entry]] = {}
         self._whole: dict[tuple[str, int, int], _Entry | None] = {}
+        self._pushes: dict[tuple[str, int, str], _Entry | None] = {}
         self._information: dict[tuple[str, int], dict[str, float]] = {}
         self._arena = Arena()
 
     def of(self, causes: Sequence[str] | None) -> Dictionary:
         """The same with fewer causes, and the columns made so far."""
         found = Dictionary(self.nominal, self.evidence, causes)
-        found._kept, found._whole = self._kept, self._whole
+        found._kept, found._whole, found._pushes = self._kept, self._whole, self._pushes
         found._information, found._arena = self._information, self._arena
         return found
 
@@ -251,6 +252,14 @@ class Dictionary:
             by_shape = ((shape, self.rows(candidate, shape)) for shape in self._grid(candidate))
             self._kept[candidate.key] = [self._entry(shape, rows) for shape, rows in by_shape if _acts(rows)]
         return self._kept[candidate.key]
+
+    def _push(self, candidate: Candidate, shape: Shape) -> _Entry | None:
+        """Of a contact, None without rows: the same bursts are left beside many sets of columns."""
+        key = (*candidate.key, repr(shape))
+        if key not in self._pushes:
+            rows = self.rows(candidate, shape)
+            self._pushes[key] = self._entry(shape, rows) if _acts(rows) else None
+        return self._pushes[key]
 
     def _onset(self, candidate: Candidate) -> Trial | None:
         """The best edge of a block for the forms that set in at a time. Products after an edge are a part of their
@@ -303,7 +312,9 @@ class Dictionary:
         for burst, link, longer in product(find_bursts(self.evidence), links, _LONGER):
             middle, duration = burst.start_s + 0.5 * burst.duration_s, longer * burst.duration_s + 0.1
             shape = Shape(time=middle, duration=duration, session=burst.session + 1, link=link)
-            trial = self.trial(candidate, shape, 20 * len(_LONGER) * self.evidence.blocks)
+            trial = self._tried(
+                candidate, self._push(candidate, shape), 20 * len(_LONGER) * self.evidence.blocks
+            )
             # Links whose frames share an origin tie, up to rounding.
             if trial is None or (best is not None and trial.score.gain < best.score.gain + 1e-6):
                 continue
@@ -320,7 +331,8 @@ class Dictionary:
             return False
         for periods in (-1.0, 1.0):
             again = shape.at(time=shape["time"] + periods * recording.period_s)
-            both = {**self.rows(trial.candidate, again)}
+            entry = self._push(trial.candidate, again)
+            both = {} if entry is None else {**entry[1]}
             for key, columns in trial.rows.items():
                 both[key] = columns + both[key] if key in both else columns
             if self.evidence.score(self.evidence.padded(both)).fitted > trial.score.fitted + _TIED:
@@ -425,9 +437,15 @@ class Dictionary:
     def trial(self, candidate: Candidate, shape: Shape, choices: int = 1) -> Trial | None:
         """The candidate with a given shape, None without rows or with implausible coefficients."""
         rows = self.rows(candidate, shape)
-        if not _acts(rows):
+        return self._tried(candidate, (shape, rows, None) if _acts(rows) else None, choices)
+
+    def _tried(
+        self, candidate: Candidate, entry: tuple[Shape, Rows, Products | None] | None, choices: int
+    ) -> Trial | None:
+        if entry is None:
             return None
-        score = self._timed(candidate, shape, self.measure(candidate, rows), choices)
+        shape, rows, known = entry
+        score = self._timed(candidate, shape, self.measure(candidate, rows, known), choices)
         plausible = candidate.effect.plausible(score.coefficients, shape)
         return Trial(candidate, shape, score, rows) if plausible else None
 
