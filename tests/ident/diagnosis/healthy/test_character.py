@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ident.diagnosis import commission, diagnose
+from ident.diagnosis import Reference, commission, diagnose
 from ident.diagnosis.causes.candidates import Candidate, Trial
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.healthy.character import Size, _carried, _kind, _Set
@@ -136,6 +136,12 @@ def sticky(make: Make, day: int, amplitude: float) -> list[Session]:
     return [make("a.mcap", 11 + 10 * day, stick), make("b.mcap", 12 + 10 * day, stick, 1)]
 
 
+@pytest.fixture(scope="module")
+def sticking(make: Make, chain: Chain) -> Reference:
+    """Of an arm whose friction rises so on both days."""
+    return commission([sticky(make, 0, 0.4), sticky(make, 1, 0.4)], chain)
+
+
 @pytest.mark.slow
 def test_friction_that_all_healthy_days_show_is_in_the_reference_and_what_comes_and_goes_is_not(
     make: Make, chain: Chain
@@ -147,12 +153,11 @@ def test_friction_that_all_healthy_days_show_is_in_the_reference_and_what_comes_
 
 @pytest.mark.slow
 def test_a_usual_change_of_what_the_healthy_arm_has_is_in_the_models_and_no_finding(
-    make: Make, chain: Chain
+    make: Make, chain: Chain, sticking: Reference
 ) -> None:
-    reference = commission([sticky(make, 0, 0.4), sticky(make, 1, 0.4)], chain)
-    (own,) = (parameter_values(entry) for entry in reference.model.effects)
+    (own,) = (parameter_values(entry) for entry in sticking.model.effects)
     for times in (0.75, 1.3):
-        found = diagnose(sticky(make, 2, 0.4 * times), chain, reference=reference)
+        found = diagnose(sticky(make, 2, 0.4 * times), chain, reference=sticking)
         assert not found.findings
         (entry,) = (entry for entry in found.base_model.effects if entry["cause"] == "stribeck")
         now = parameter_values(entry)
@@ -164,27 +169,26 @@ def test_a_usual_change_of_what_the_healthy_arm_has_is_in_the_models_and_no_find
         assert told["parameters"]["amplitude"]["value"] == own["amplitude"]
         assert set(told["parameters"]["amplitude"]) == {"value", "std", "unit"}
         assert "The healthy arm has: stribeck (two)." in str(found)
-    findings = diagnose(sticky(make, 2, 1.2), chain, reference=reference).findings
+    findings = diagnose(sticky(make, 2, 1.2), chain, reference=sticking).findings
     assert [(f.cause, f.joints) for f in findings] == [("stribeck", (2,))]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("known_to", "causes"), [(0.02, ["stribeck"]), (0.5, [])])
 def test_a_law_of_the_speed_within_the_error_of_the_healthy_one_is_no_change(
-    make: Make, chain: Chain, known_to: float, causes: list[str]
+    make: Make, chain: Chain, sticking: Reference, known_to: float, causes: list[str]
 ) -> None:
-    reference = commission([sticky(make, 0, 0.4), sticky(make, 1, 0.4)], chain)
-    (entry,) = reference.model.effects
+    (entry,) = sticking.model.effects
     amplitude = entry["parameters"]["amplitude"]
     # Other shapes fit the days about as well, and rise otherwise towards a standstill.
     assert 0.05 < amplitude["std"] / amplitude["value"] < 0.4
     parameters = {**entry["parameters"], "amplitude": {**amplitude, "std": known_to * amplitude["value"]}}
-    model = replace(reference.model, effects=({**entry, "parameters": parameters},))
+    model = replace(sticking.model, effects=({**entry, "parameters": parameters},))
 
     def more(s: Signals) -> None:
         v = s["qd"][:, 1]
         s["motor"][:, 1] += np.sign(v) * (0.4 * np.exp(-np.abs(v) / 0.1) + 0.3 * np.exp(-((v / 0.15) ** 2)))
 
     day = [make("a.mcap", 31, more), make("b.mcap", 32, more, 1)]
-    found = diagnose(day, chain, reference=replace(reference, model=model))
+    found = diagnose(day, chain, reference=replace(sticking, model=model))
     assert [f.cause for f in found.findings] == causes
