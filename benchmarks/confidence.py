@@ -3,14 +3,16 @@
     python -m benchmarks.confidence campaign/results.jsonl mujoco_cases
     python -m benchmarks.confidence campaign/results.jsonl mujoco_cases --write
     python -m benchmarks.confidence --alone campaign/results_without_reference.jsonl mujoco_cases --write
+    python -m benchmarks.confidence --onward campaign/results.jsonl other_arms/results.jsonl --write
     python -m benchmarks.confidence --check other/results.jsonl --check other_cases --diagram confidence.svg
 
 Reads the findings of campaigns of `benchmarks.discovery` (their `results.jsonl`) and of `benchmarks.mujoco_arms` (their
 folder), for the fit with the names that were doubted. The weights of `ident/diagnosis/verdict/confidence.yaml`, or with
 `--alone` of `confidence_alone.yaml`, are those of a logistic regression with the signs of
 `ident.diagnosis.verdict.confidence.SIGNS`, each generator with the same weight, and a pull to `START` chosen by
-cross-validation over whole cases. The reliability printed for the fit is that of cross-validation too. `--check` judges
-the confidence as the diagnoses stated it.
+cross-validation over whole cases. With `--onward` the pull is to the stored weights and not weak, for these know
+findings of arms that are in none of the campaigns. The reliability printed for the fit is that of cross-validation too.
+`--check` judges the confidence as the diagnoses stated it.
 """
 
 from __future__ import annotations
@@ -35,6 +37,8 @@ from benchmarks.mujoco_arms.judging import diagnosis_of, names, of_character, ve
 Floats = NDArray[np.float64]
 
 _RIDGES = (0.03, 0.1, 0.3, 1.0, 3.0)
+# Of a fit onward from another one: of some hundred findings, as those of the campaigns.
+_ONWARD = (1.0, 3.0, 10.0)
 _PARTS = 10
 # Findings of a generator for its full weight.
 _ENOUGH = 50
@@ -103,11 +107,17 @@ def _mujoco(path: Path, reference: bool) -> list[Content]:
     return found
 
 
-def fit(points: Floats, right: Floats, weight: Floats, ridge: float) -> Floats:
-    """Intercept and weights (1 + k,) of the logistic regression; points (n, k) from 0 to 1."""
+def judged() -> Floats:
+    """Intercept and weights (1 + k,) before any finding."""
+    return np.array([_INTERCEPT, *(stored.START[name] for name in stored.LIMITS)])
+
+
+def fit(points: Floats, right: Floats, weight: Floats, ridge: float, start: Floats | None = None) -> Floats:
+    """Intercept and weights (1 + k,) of the logistic regression; points (n, k) from 0 to 1. start : the same of the
+    pull, default `judged`."""
     signs = [stored.SIGNS[name] for name in stored.LIMITS]
     columns = np.column_stack([np.ones(len(points)), points])
-    start = np.array([_INTERCEPT, *(stored.START[name] for name in stored.LIMITS)])
+    start = judged() if start is None else start
 
     def loss(theta: Floats) -> tuple[float, Floats]:
         odds = columns @ theta
@@ -120,7 +130,9 @@ def fit(points: Floats, right: Floats, weight: Floats, ridge: float) -> Floats:
     return np.asarray(minimize(loss, start, jac=True, bounds=bounds).x)
 
 
-def held_back(said: Sequence[Said], points: Floats, right: Floats, weight: Floats, ridge: float) -> Floats:
+def held_back(
+    said: Sequence[Said], points: Floats, right: Floats, weight: Floats, ridge: float, start: Floats
+) -> Floats:
     """Probability (n,) of each finding by a fit to the cases of other parts."""
     cases = [f"{one.source} {one.case}" for one in said]
     order = {case: k for k, case in enumerate(np.random.default_rng(1).permutation(sorted(set(cases))))}
@@ -129,7 +141,7 @@ def held_back(said: Sequence[Said], points: Floats, right: Floats, weight: Float
     for k in range(_PARTS):
         out = part == k
         if out.any():
-            theta = fit(points[~out], right[~out], weight[~out], ridge)
+            theta = fit(points[~out], right[~out], weight[~out], ridge, start)
             found[out] = 1.0 / (1.0 + np.exp(-(theta[0] + points[out] @ theta[1:])))
     return found
 
@@ -169,6 +181,7 @@ def table(sources: Sequence[str], p: Floats, right: Floats) -> str:
 @click.command()
 @click.argument("campaigns", nargs=-1, type=click.Path(path_type=Path, exists=True))
 @click.option("--alone", is_flag=True, help="Of diagnoses without a reference, whose weights are apart.")
+@click.option("--onward", is_flag=True, help="Pull towards the stored weights.")
 @click.option("--write", is_flag=True, help="Store the weights.")
 @click.option(
     "--check",
@@ -178,12 +191,17 @@ def table(sources: Sequence[str], p: Floats, right: Floats) -> str:
 )
 @click.option("--diagram", type=click.Path(path_type=Path), help="Draw the reliability of --check.")
 def main(
-    campaigns: tuple[Path, ...], alone: bool, write: bool, check: tuple[Path, ...], diagram: Path | None
+    campaigns: tuple[Path, ...],
+    alone: bool,
+    onward: bool,
+    write: bool,
+    check: tuple[Path, ...],
+    diagram: Path | None,
 ) -> None:
     """Fit the confidence to campaigns, or check it on others."""
     if campaigns:
         said = [one for path in campaigns for one in read(path, doubted=True, reference=not alone)]
-        _fit(said, stored.ALONE if alone else stored.WEIGHTS, write)
+        _fit(said, stored.ALONE if alone else stored.WEIGHTS, onward=onward, write=write)
     if check:
         said = [one for path in check for one in read(path, reference=not alone)]
         p, right = (np.array([getattr(one, key) for one in said], float) for key in ("confidence", "right"))
@@ -192,7 +210,7 @@ def main(
             _draw([one.source for one in said], p, right, diagram)
 
 
-def _fit(said: Sequence[Said], name: str, write: bool) -> None:
+def _fit(said: Sequence[Said], name: str, *, onward: bool, write: bool) -> None:
     said = [one for one in said if one.grounds]
     if any(bool(one.grounds.get("alone")) != (name == stored.ALONE) for one in said):
         raise click.ClickException("diagnoses with and without a reference have weights apart; see --alone")
@@ -204,14 +222,18 @@ def _fit(said: Sequence[Said], name: str, write: bool) -> None:
     # A handful of findings says little about its generator.
     weight = np.array([1.0 / max(count[one.source], _ENOUGH) for one in said])
     weight *= len(said) / weight.sum()
-    losses = {
-        ridge: log_loss(held_back(said, points, right, weight, ridge), right, weight) for ridge in _RIDGES
+    path = Path(stored.__file__).with_name(name)
+    start = np.concatenate([np.atleast_1d(one) for one in stored.fitted(name)]) if onward else judged()
+    apart = {
+        ridge: held_back(said, points, right, weight, ridge, start)
+        for ridge in (_ONWARD if onward else _RIDGES)
     }
+    losses = {ridge: log_loss(p, right, weight) for ridge, p in apart.items()}
     ridge = min(losses, key=lambda r: losses[r])
-    p = held_back(said, points, right, weight, ridge)
+    p = apart[ridge]
     click.echo(f"ridge {ridge}: -log p of what is true {losses[ridge]:.3f} in cross-validation")
     click.echo(table([one.source for one in said], p, right))
-    theta = fit(points, right, weight, ridge)
+    theta = fit(points, right, weight, ridge, start)
     weights = dict(zip(stored.LIMITS, (round(float(v), 3) for v in theta[1:]), strict=True))
     content = {
         "findings": len(said),
@@ -220,10 +242,12 @@ def _fit(said: Sequence[Said], name: str, write: bool) -> None:
         "intercept": round(float(theta[0]), 3),
         "weights": weights,
     }
+    if onward:
+        earlier = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content["findings_before"] = earlier["findings"] + earlier.get("findings_before", 0)
     text = yaml.safe_dump(content, sort_keys=False)
     click.echo(text)
     if write:
-        path = Path(stored.__file__).with_name(name)
         path.write_text(f"# Written by `python -m benchmarks.confidence`.\n{text}", encoding="utf-8")
 
 

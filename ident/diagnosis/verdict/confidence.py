@@ -128,13 +128,14 @@ def believable(grounds: Mapping[str, float]) -> bool:
 
 def probability(grounds: Grounds) -> float:
     """Probability of a finding with these grounds to be right."""
-    intercept, weights = _fitted(ALONE if grounds.alone else WEIGHTS)
+    intercept, weights = fitted(ALONE if grounds.alone else WEIGHTS)
     odds = intercept + float(weights @ scaled(asdict(grounds)))
     return 1.0 / (1.0 + math.exp(-odds))
 
 
 @cache
-def _fitted(name: str = WEIGHTS) -> tuple[float, np.ndarray[Any, np.dtype[np.float64]]]:
+def fitted(name: str = WEIGHTS) -> tuple[float, np.ndarray[Any, np.dtype[np.float64]]]:
+    """Intercept and weights (12,), in the order of `LIMITS`, of a file of this folder."""
     text = (resources.files("ident.diagnosis.verdict") / name).read_text(encoding="utf-8")
     content = yaml_content(text)
     if set(content["weights"]) != set(LIMITS):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.confidence import fit, reliability
+from benchmarks.confidence import fit, judged, reliability
 from ident.diagnosis.causes.candidates import _scan
 from ident.diagnosis.verdict.confidence import LIMITS, SIGNS, Grounds, believable, probability, scaled
 
@@ -68,6 +68,17 @@ def test_the_fit_finds_the_odds_behind_findings() -> None:
     p = 1.0 / (1.0 + np.exp(-theta[0] - points @ theta[1:]))
     assert reliability(p, right)[1] < 0.02
     assert reliability(np.full(4000, 0.99), right)[1] > 0.2
+
+
+def test_a_fit_onward_stays_near_the_earlier_one_where_findings_are_few() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(0.0, 1.0, (4000, len(LIMITS)))
+    start = judged()
+    start[1] = 5.0
+    few = fit(points[:4], np.zeros(4), np.ones(4), 1.0, start)
+    many = fit(points, np.zeros(4000), np.ones(4000), 1.0, start)
+    assert np.max(np.abs(few - start)) < 1.0
+    assert many[0] < start[0] - 3.0
 
 
 def test_a_weak_push_of_two_seconds_stands_out_in_no_window_and_is_found() -> None:
