@@ -11,7 +11,7 @@ from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
 from ident.estimation.automatic import choose
-from ident.estimation.identify import IdentificationSettings, identify
+from ident.estimation.identify import IdentificationSettings, Known, identify
 from ident.estimation.mounting import find_mounting, tilt_columns
 from ident.estimators import nearest_consistent
 from ident.rows.filters import SignalSettings
@@ -72,7 +72,7 @@ def leaning(about_x: float, about_y: float) -> np.ndarray:
 @pytest.mark.parametrize("angles", [(0.03, -0.01), (-0.005, 0.002)])
 def test_a_lean_of_the_base_is_found_with_its_sign(angles: tuple[float, float]) -> None:
     truth = leaning(*angles)
-    found = find_mounting([recorded(truth, seed=4)], upright(), MODEL_1)
+    found = find_mounting([recorded(truth, seed=4)], upright(), MODEL_1, known=Known())
     skewed = dataclasses.replace(found, axes=np.array([[1.0, -2.03e-23, 1e-9], [-1e-17, 1.0, 0.0]]))
     assert "about [1, 0, 0]" in str(skewed)
     assert "about [0, 1, 0]" in str(skewed)
@@ -89,7 +89,8 @@ def test_a_lean_of_the_base_is_found_with_its_sign(angles: tuple[float, float]) 
 def test_an_upright_base_stays_upright() -> None:
     probabilities = []
     for seed in range(4):
-        found = find_mounting([recorded(leaning(0.0, 0.0), seed=seed)], upright(), MODEL_1)
+        log = recorded(leaning(0.0, 0.0), seed=seed)
+        found = find_mounting([log], upright(), MODEL_1, known=Known())
         assert np.rad2deg(np.linalg.norm(found.tilt_rad)) < 0.1
         probabilities.append(found.p_value)
     assert min(probabilities) > 0.01
@@ -107,7 +108,8 @@ def test_the_masses_of_a_placeholder_do_not_hold_the_base_upright(tmp_path: Path
 
 
 def test_the_lean_is_part_of_what_is_printed_and_stored() -> None:
-    found = find_mounting([recorded(leaning(0.03, 0.0), seed=1)], upright(), MODEL_1)
+    log = recorded(leaning(0.03, 0.0), seed=1)
+    found = find_mounting([log], upright(), MODEL_1, known=Known())
     assert str(found).startswith("the base leans by 1.7")
     content = found.to_dict()
     assert content["converged"] is True

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ident.estimation.channel_errors import EXACT_CHANNELS, beside_channel_errors
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identify import Identification, IdentificationSettings, Known, identify
 from ident.estimators import CovarianceSettings
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session, true_base
@@ -39,7 +39,7 @@ def with_channels(gain: float, crosstalk: float, seed: int) -> list[Session]:
 
 
 def identified(sessions: Sequence[Session], **more: Any) -> Identification:
-    return identify(sessions, chain(), IdentificationSettings(essential=None, **more))
+    return identify(sessions, chain(), IdentificationSettings(essential=None, **more), known=Known())
 
 
 def near(found: Identification, std: np.ndarray) -> float:

@@ -13,7 +13,7 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
 from ident.estimation.automatic import BesideGains, choose
 from ident.estimation.estimator_comparison import EstimatorComparison, Kind
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identify import Identification, IdentificationSettings, Known, identify
 from ident.estimation.parts import PARTS, beside, held_back_parts
 from ident.estimators import MaximumAPosteriori, Prior, Problem, RowGroup, WeightedLeastSquares
 from ident.estimators.physical import lacking_bodies
@@ -23,6 +23,8 @@ from tests.ident.regression_problems import design, problem
 
 SENSORS = Sensors(position=1e-5, joint=0.2, correlation_s=0.3)
 MODEL_1 = IdentificationSettings(model=1, estimator="auto", essential=None)
+# No doubts about the sessions: the choice is the same without their screening.
+SCREENED = Known()
 
 
 @lru_cache
@@ -34,7 +36,7 @@ def chosen(periods: int = 3, kilogrammes: float | None = None) -> Identification
         text = re.sub(r'<mass value="[^"]*"', f'<mass value="{kilogrammes}"', text)
         text = re.sub(r'<origin xyz="[^"]*"(?=[^<]*/>\s*<mass)', '<origin xyz="0 0 0"', text)
     logs = [session(sensors=SENSORS, motor=False, periods=periods)]
-    return identify(logs, Chain.from_urdf(text), MODEL_1)
+    return identify(logs, Chain.from_urdf(text), MODEL_1, known=SCREENED if kilogrammes else None)
 
 
 def repeated(shift: int = 0) -> Problem:
@@ -102,7 +104,9 @@ def test_what_predicts_no_better_than_zero_is_no_choice(
         return share[:, None] * torque
 
     monkeypatch.setattr(EstimatorComparison, "_errors", errors)
-    found = choose([session(sensors=SENSORS, motor=False, periods=3)], chain(), MODEL_1, tilt=False)
+    found = choose(
+        [session(sensors=SENSORS, motor=False, periods=3)], chain(), MODEL_1, tilt=False, known=SCREENED
+    )
     assert found.choice is not None
     assert found.choice.winner.estimator == winner
     assert ("not compared" in " ".join(found.choice.advice)) == (winner == "physical")
@@ -113,12 +117,12 @@ def test_a_tilt_is_found_where_it_helps():
     log = session(sensors=SENSORS, motor=False, periods=3)
     turn = np.deg2rad(2.0)
     turned = Chain.from_urdf(chain().urdf, gravity=(0.0, 9.81 * np.sin(turn), -9.81 * np.cos(turn)))
-    found = choose([log], turned, MODEL_1)
+    found = choose([log], turned, MODEL_1, known=SCREENED)
     assert found.choice is not None
     assert found.choice.mounting is not None
     assert np.rad2deg(np.linalg.norm(found.choice.mounting.tilt_rad)) == pytest.approx(2.0, abs=0.3)
     assert "the base leans by" in str(found.choice)
-    upright = choose([log], turned, MODEL_1, tilt=False)
+    upright = choose([log], turned, MODEL_1, known=SCREENED, tilt=False)
     assert upright.choice is not None
     assert not any(candidate.tilt for candidate in upright.choice.candidates)
 
@@ -127,7 +131,8 @@ def test_an_earlier_choice_is_taken_for_other_sessions_and_estimates_anew(monkey
     first = chosen(kilogrammes=4.0).choice
     assert first is not None
     monkeypatch.setattr("ident.estimation.automatic.compared", None)
-    again = choose([session(sensors=SENSORS, motor=False, seed=7)], chain(), MODEL_1, like=first)
+    other = session(sensors=SENSORS, motor=False, seed=7)
+    again = choose([other], chain(), MODEL_1, known=SCREENED, like=first)
     assert again.choice is not None
     assert again.choice.winner == first.winner
     assert again.choice.used == first.used
@@ -138,7 +143,8 @@ def test_a_sensor_that_reads_too_much_is_found_and_stated_as_an_effect():
     log = session(sensors=SENSORS, motor=False, periods=3)
     effort = log.joint.effort.copy()
     effort[:, 1] *= 1.08
-    found = identify(replace(log, joint=replace(log.joint, effort=effort)), chain(), MODEL_1)
+    changed = replace(log, joint=replace(log.joint, effort=effort))
+    found = identify(changed, chain(), MODEL_1, known=SCREENED)
     assert found.choice is not None
     (joint,) = found.choice.gains
     assert joint == chain().joint_names[1]
@@ -162,7 +168,8 @@ def test_an_error_common_to_most_sensors_is_one_of_the_bodies():
     log = session(sensors=SENSORS, motor=False, periods=3)
     effort = log.joint.effort.copy()
     effort[:, 3] *= 0.84
-    found = identify(replace(log, joint=replace(log.joint, effort=effort)), chain(), MODEL_1)
+    changed = replace(log, joint=replace(log.joint, effort=effort))
+    found = identify(changed, chain(), MODEL_1, known=SCREENED)
     assert found.choice is not None
     assert list(found.choice.gains) == ["A3"]
     assert found.choice.gains["A3"][0] == pytest.approx(-0.16, abs=0.01)
@@ -181,7 +188,8 @@ def test_a_joint_that_a_gain_explains_weighs_by_what_is_left():
     log = session(sensors=replace(SENSORS, joint=0.02), motor=False, periods=3)
     effort = log.joint.effort.copy()
     effort[:, 3] *= 1.08
-    found = identify(replace(log, joint=replace(log.joint, effort=effort)), chain(), MODEL_1)
+    changed = replace(log, joint=replace(log.joint, effort=effort))
+    found = identify(changed, chain(), MODEL_1, known=SCREENED)
     assert found.choice is not None
     # With the weights of the model without it: least squares, and a deviation of 0.0065.
     assert found.choice.winner.estimator == "physical"
@@ -221,7 +229,7 @@ def test_a_urdf_without_bodies_leaves_least_squares_and_the_reason():
     assert isinstance(text, str)
     bare = Chain.from_urdf(re.sub(r"<inertial>.*?</inertial>", "", text, flags=re.DOTALL))
     log = session(sensors=SENSORS, motor=False)
-    found = identify([log], bare, MODEL_1)
+    found = identify([log], bare, MODEL_1, known=SCREENED)
     assert found.choice is not None
     assert {candidate.estimator for candidate in found.choice.candidates} == {"wls"}
     assert found.choice.excluded == ("physical: the URDF states no bodies",)
@@ -301,7 +309,8 @@ def test_the_distance_from_a_right_prior_is_chi_square():
 
 def test_least_squares_stays_one_word_away():
     log = session(sensors=SENSORS, motor=False)
-    found = identify([log], chain(), IdentificationSettings(model=1, essential=None))
+    settings = IdentificationSettings(model=1, essential=None)
+    found = identify([log], chain(), settings, known=SCREENED)
     assert found.choice is None
     assert found.estimate.method == "WLS"
     assert np.abs(found.estimate.values - true_base(found)).max() < 5.0
@@ -322,7 +331,7 @@ def test_a_leaning_base_has_to_pay_against_the_same_estimator_upright(
     monkeypatch.setattr(EstimatorComparison, "_errors", errors)
     monkeypatch.setattr(EstimatorComparison, "_leans", lambda *_: True)
     monkeypatch.setattr(EstimatorComparison, "_wider", lambda *_: iter(()))
-    found = choose([session(sensors=SENSORS, motor=False, periods=3)], chain(), MODEL_1)
+    found = choose([session(sensors=SENSORS, motor=False, periods=3)], chain(), MODEL_1, known=SCREENED)
     assert found.choice is not None
     assert (found.choice.winner.estimator, found.choice.winner.tilt) == ("physical", False)
     assert "the lower error of wls is no proof" in str(found.choice)

@@ -25,6 +25,8 @@ TABLE_2 = [
     "XX4R", "ZZ4R", "MY4R", "MY5R", "MY6R", "XX8", "YY8", "YZ8", "ZZ8", "MY8", "MZ8", "M8",
 ]
 # fmt: on
+# For sessions of a healthy arm: their screening takes half of the time and has tests of its own.
+SCREENED = Known()
 
 
 @lru_cache
@@ -87,14 +89,14 @@ def test_commanded_motion_tests_exogeneity():
 
 
 def test_model_1_needs_no_motor_channel():
-    found = identify(sessions(motor=False), arm.chain(), IdentificationSettings(model=1))
+    found = identify(sessions(motor=False), arm.chain(), IdentificationSettings(model=1), known=SCREENED)
     assert found.counts["base"] == 74
     z = errors(found)
     assert np.mean(np.abs(z) < 3) >= 0.95
 
 
 def test_model_3_finds_the_drives_from_the_difference():
-    found = identify(sessions(), arm.chain(), IdentificationSettings(model=3))
+    found = identify(sessions(), arm.chain(), IdentificationSettings(model=3), known=SCREENED)
     assert found.counts["base"] == 28
     assert {name.rstrip("1234567") for name in found.base.names} == {"Ia", "Fvm", "Fcm", "offm"}
     assert np.mean(np.abs(errors(found)) < 3) >= 0.95
@@ -102,7 +104,8 @@ def test_model_3_finds_the_drives_from_the_difference():
 
 def test_a_session_without_motor_torques_adds_its_joint_rows():
     bare, loaded = sessions()
-    found = identify([dataclasses.replace(bare, motor=None), loaded], arm.chain(), IdentificationSettings())
+    mixed = [dataclasses.replace(bare, motor=None), loaded]
+    found = identify(mixed, arm.chain(), IdentificationSettings(), known=SCREENED)
     assert found.counts["base"] == 102
     assert np.mean(np.abs(errors(found)) < 3) >= 0.95
 
@@ -124,8 +127,7 @@ def test_stated_intervals_cover_over_many_sessions():
             )
             for loaded in (False, True)
         ]
-        # Healthy as they are, they need no screening.
-        found = identify(recorded, arm.chain(), settings, known=Known())
+        found = identify(recorded, arm.chain(), settings, known=SCREENED)
         truth = arm.true_base(found)
         for result, which in ((inside, None), (textbook, "textbook")):
             low, high = found.estimate.interval(0.95, covariance=which).T
@@ -140,6 +142,7 @@ def test_averaged_periods_give_the_same_parameters_from_fewer_rows():
         sessions(),
         arm.chain(),
         IdentificationSettings(essential=None, signals=SignalSettings(average_periods=True)),
+        known=SCREENED,
     )
     assert averaged.problem.rows < 0.6 * whole.problem.rows
     shift = (averaged.estimate.values - whole.estimate.values) / whole.estimate.std
@@ -148,7 +151,8 @@ def test_averaged_periods_give_the_same_parameters_from_fewer_rows():
 
 @pytest.mark.parametrize("name", ["ols", "huber", "tukey", "tls", "map", "physical", "recursive", "mixing"])
 def test_every_estimator_by_name(name):
-    found = identify(sessions(), arm.chain(), IdentificationSettings(estimator=name, essential=None))
+    settings = IdentificationSettings(estimator=name, essential=None)
+    found = identify(sessions(), arm.chain(), settings, known=SCREENED)
     z = errors(found)
     assert np.sqrt(np.mean(z**2)) < 2.0
     assert np.mean(np.abs(z) < 3) >= 0.9
@@ -156,20 +160,20 @@ def test_every_estimator_by_name(name):
 
 def test_a_prior_model_sharpens_an_estimate_from_a_loaded_session_alone():
     loaded = sessions()[1:]
-    found = identify(loaded, arm.chain(), IdentificationSettings(essential=None))
+    found = identify(loaded, arm.chain(), IdentificationSettings(essential=None), known=SCREENED)
     assert found.counts["base"] == 92
     assert any("add an unloaded session" in warning for warning in found.warnings)
 
 
 def test_covariance_settings_reach_the_result():
     settings = IdentificationSettings(covariance=CovarianceSettings("hac", bandwidth_s=1.0), essential=None)
-    found = identify(sessions(), arm.chain(), settings)
+    found = identify(sessions(), arm.chain(), settings, known=SCREENED)
     assert found.estimate.covariance.kind.startswith("HAC (Bartlett, stated bandwidth 1.00 s)")
 
 
 def test_essential_lists_reach_the_result():
     settings = IdentificationSettings(essential=EssentialSettings(keep=("Fvl",), drop=("offm",)))
-    found = identify(sessions(), arm.chain(), settings)
+    found = identify(sessions(), arm.chain(), settings, known=SCREENED)
     assert {f"Fvl{k}" for k in range(1, 8)} <= set(found.essential.names)
     assert not any(name.startswith("offm") for name in found.essential.names)
 
@@ -252,16 +256,15 @@ def test_a_payload_that_hung_in_the_session_of_the_bare_arm_is_refused(mass):
 
 def test_a_stated_mass_must_be_a_number():
     bare, loaded = sessions()
+    heavy = [bare, named(loaded, "payload", "heavy")]
     with pytest.raises(DataError, match="`payload_mass` 'heavy' in the metadata is no number"):
-        identify(
-            [bare, named(loaded, "payload", "heavy")], arm.chain(), IdentificationSettings(essential=None)
-        )
+        identify(heavy, arm.chain(), IdentificationSettings(essential=None), known=SCREENED)
 
 
 def test_a_payload_of_another_mass_than_stated_is_noticed():
     bare, loaded = sessions()
     stated = dataclasses.replace(loaded, metadata={**loaded.metadata, "payload_mass": "1.5"})
-    found = identify([bare, stated], arm.chain(), IdentificationSettings(essential=None))
+    found = identify([bare, stated], arm.chain(), IdentificationSettings(essential=None), known=SCREENED)
     assert any("against 1.500 kg stated" in warning for warning in found.warnings)
 
 
