@@ -166,11 +166,13 @@ class Evidence:
         for key, matrix in self._columns.items():
             weight, t = self._weights[key], self._targets[key]
             on, starts = self._acting[key], self._starts[key[0]]
+            gram, target = np.empty((self.blocks, len(on), len(on))), np.empty((self.blocks, len(on)))
             for block, (first, last) in enumerate(pairwise(starts.tolist())):
                 own, torque = matrix[first:last], t[first:last, 0]
-                self._base_gram[block, on[:, None], on] += weight * (own.T @ own)
-                self._base_target[block, on] += weight * (own.T @ torque)
+                gram[block], target[block] = own.T @ own, own.T @ torque
                 self.energy[block] += weight * float(torque @ torque)
+            self._base_gram[:, on[:, None], on] += weight * gram
+            self._base_target[:, on] += weight * target
 
     def _places(self) -> Iterator[tuple[slice, Rows]]:
         """The further columns with their places behind the base."""
@@ -283,7 +285,7 @@ class Evidence:
                 place += width_of(rows)
         further = partial(self._further, columns, list(self.extra))
         sums = np.concatenate([known.crossed[id(rows)] for rows in self.extra], axis=2)
-        return replace(known, further=further, further_sums=sums)
+        return replace(known, further=further, further_sums=sums, plain=known)
 
     def _further(self, columns: _Columns, groups: Sequence[Rows]) -> Floats:
         """Products (blocks, k, w) of padded columns with groups of further columns."""

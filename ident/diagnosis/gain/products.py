@@ -38,6 +38,7 @@ class Products:
     alone : (blocks, k, p) with the base parameters; own (blocks, k, k); target (blocks, k). parts : (parts, blocks),
     1 for the blocks of a part held back in turn. further : makes those with the further columns (blocks, k, w) on
     demand; further_sums : their sums (parts, k, w). crossed : such sums by group of further columns, as met so far.
+    plain : the same without further columns, which remembers its own sums.
     """
 
     alone: Floats
@@ -47,6 +48,7 @@ class Products:
     further: Callable[[], Floats] | None = None
     further_sums: Floats | None = None
     crossed: dict[int, Floats] = field(default_factory=dict)
+    plain: Products | None = None
 
     @cached_property
     def base(self) -> Floats:
@@ -56,10 +58,10 @@ class Products:
     @cached_property
     def sums(self) -> Sums:
         """Base, own and target of each part."""
-        base = block_sums(self.parts, self.alone)
-        if self.further_sums is not None:
-            base = np.concatenate([base, self.further_sums], axis=2)
-        return base, block_sums(self.parts, self.own), self.parts @ self.target
+        if self.plain is not None and self.further_sums is not None:
+            base, own, target = self.plain.sums
+            return np.concatenate([base, self.further_sums], axis=2), own, target
+        return block_sums(self.parts, self.alone), block_sums(self.parts, self.own), self.parts @ self.target
 
     def only(self, on: Floats) -> Products:
         """Products of the blocks with weight 1 in `on` (blocks,) alone."""
@@ -69,7 +71,9 @@ class Products:
 
 def width_of(rows: Rows) -> int:
     """Number of columns, 0 without rows."""
-    return next((columns.shape[1] for columns in rows.values()), 0)
+    for columns in rows.values():
+        return columns.shape[1]
+    return 0
 
 
 def scale_of(squares: Floats) -> Floats:
