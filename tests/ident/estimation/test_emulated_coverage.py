@@ -24,7 +24,7 @@ SEEDS = (11, 12, 13)
 def pairs(tmp_path_factory: pytest.TempPathFactory) -> list[Identification]:
     folder = tmp_path_factory.mktemp("pairs")
     return [
-        identify(record_pair(folder, seed, period_s=12.0), chain(), IdentificationSettings())
+        identify(record_pair(folder, seed, period_s=12.0, cycle_ms=8), chain(), IdentificationSettings())
         for seed in SEEDS
     ]
 
