@@ -37,8 +37,14 @@ def found(logs: tuple[list[Session], Session], chain: Chain) -> Diagnosis:
     return diagnose(logs[0], chain, test=[logs[1]], causes=["cable_spring"])
 
 
-def test_the_torque_errors_are_those_of_validate(logs: tuple[list[Session], Session], chain: Chain) -> None:
-    told = found(logs, chain)
+@pytest.fixture(scope="module")
+def told(logs: tuple[list[Session], Session], chain: Chain) -> Diagnosis:
+    return found(logs, chain)
+
+
+def test_the_torque_errors_are_those_of_validate(
+    logs: tuple[list[Session], Session], told: Diagnosis
+) -> None:
     assert {f.joints for f in told.claims} == {(2,), (3,)}
     extended, base = (TorqueErrors.of(model, [logs[1]]) for model in (told.extended_model, told.base_model))
     for model, own in ((told.extended_model, extended), (told.base_model, base)):
@@ -103,9 +109,13 @@ def test_reversals_are_no_reason_against_what_predicts_the_motion() -> None:
 
 @pytest.mark.parametrize("harmful", [2, 3])
 def test_an_effect_that_raises_the_torque_error_is_not_in_the_extension(
-    logs: tuple[list[Session], Session], chain: Chain, monkeypatch: pytest.MonkeyPatch, harmful: int
+    logs: tuple[list[Session], Session],
+    chain: Chain,
+    told: Diagnosis,
+    monkeypatch: pytest.MonkeyPatch,
+    harmful: int,
 ) -> None:
-    sure = {f.joints: f.confidence for f in found(logs, chain).claims}
+    sure = {f.joints: f.confidence for f in told.claims}
 
     def measured(model: DynamicModel, sessions: Sequence[Session]) -> TorqueErrors:
         joints = [entry["joints"] for entry in model.effects]
@@ -113,13 +123,13 @@ def test_an_effect_that_raises_the_torque_error_is_not_in_the_extension(
         return TorqueErrors(error, error, error)
 
     monkeypatch.setattr(TorqueErrors, "of", measured)
-    told = found(logs, chain)
+    spared = found(logs, chain)
     other = 5 - harmful
-    assert [entry["joints"] for entry in told.extended_model.effects] == [[other]]
-    left = {f.joints: f.confidence for f in told.claims}
+    assert [entry["joints"] for entry in spared.extended_model.effects] == [[other]]
+    left = {f.joints: f.confidence for f in spared.claims}
     assert left[other,] == sure[other,]
     assert left.get((harmful,), 0.0) <= 0.7 < sure[harmful,]
-    assert told.rms_extended["joint"][harmful - 1] > 2.0 * told.rms_extended["joint"][other - 1]
+    assert spared.rms_extended["joint"][harmful - 1] > 2.0 * spared.rms_extended["joint"][other - 1]
 
 
 def three_errors(s: dict) -> None:
