@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from ident.diagnosis import ArmData, Diagnosis, Reference, commission, diagnose
+from ident.diagnosis import ArmData, Diagnosis, Reference, diagnose
 from ident.diagnosis.rows.recording import sensor_limits
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
@@ -181,12 +181,6 @@ def test_constant_payload_error_needs_the_reference(
     assert any("no reference" in note for note in alone.notes)
     found = diagnose(sessions, chain, reference=reference)
     assert found.claims[0].cause == "payload_error"
-
-
-@pytest.fixture(scope="module")
-def reference(make: Make, chain: Chain) -> Reference:
-    """Two days tell that the gains of these sensors do not change from day to day."""
-    return commission([pair(make, seed=1), pair(make, seed=3)], chain)
 
 
 def test_reference_alone_claims_nothing(make: Make, chain: Chain, reference: Reference) -> None:

@@ -32,11 +32,6 @@ def friction(share: float, joint: int = 1) -> Callable[[Signals], None]:
 
 
 @pytest.fixture(scope="module")
-def reference(make: Make, chain: Chain) -> Reference:
-    return commission([pair(make, seed=11), pair(make, seed=21)], chain)
-
-
-@pytest.fixture(scope="module")
 def of_worn_arm(make: Make, chain: Chain, reference: Reference) -> Diagnosis:
     return diagnose(pair(make, friction(1.0)), chain, reference=reference)
 
