@@ -167,13 +167,15 @@ def _at_another_phase(reference: Reference | None) -> Reference | None:
 def _unknown_delay(task: Task, claim: Claim) -> float:
     """Largest delay [s] of a late channel on a healthy arm, 0 if a reference gives it.
 
-    A motor torque published by another clock than the positions waits for a tick of its own and for the next packet:
-    a property of the controller's program, indistinguishable from a fault of this size.
+    A motor torque published by another clock than the positions waits for a tick of its own and for the next packet,
+    one of the same clock for the latter alone: a property of the controller's program, indistinguishable from a fault
+    of this size.
     """
     if task.arm.encoder_known or _channel(claim) != "motor":
         return 0.0
-    stretches = [s for r in task.recordings for s in r.stretches if s.own_clock]
-    return max((usual_step(s.motor_time) + usual_step(s.time) for s in stretches), default=0.0)
+    stretches = [s for r in task.recordings for s in r.stretches if len(s.motor_time) > 1]
+    waits = [usual_step(s.motor_time) + usual_step(s.time) * s.own_clock for s in stretches]
+    return max(waits, default=0.0)
 
 
 def _corrected_delay(claim: Claim, finding: Finding) -> str:
@@ -187,7 +189,7 @@ def _corrected_delay(claim: Claim, finding: Finding) -> str:
 def _own_delay(claim: Claim, limit: float) -> str:
     return (
         f"motor torques come {1e3 * _made(claim):.1f} ms after the positions; this delay was corrected. The healthy "
-        f"delay is unknown without a reference, so a delay below {1e3 * limit:.0f} ms (one sample of each channel) is "
+        f"delay is unknown without a reference, so a delay below {1e3 * limit:.0f} ms (the wait for a sample) is "
         "not reported as a finding"
     )
 

@@ -193,7 +193,7 @@ def test_what_shows_faintly_is_unsure_and_named_only_where_held_out_sessions_bea
 ) -> None:
     def faint(s: Signals) -> None:
         v = s["qd"][:, 1]
-        s["motor"][:, 1] += 0.13 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
+        s["motor"][:, 1] += 0.08 * np.sign(v) * np.exp(-np.abs(v) / 0.15)
 
     fitted, held = pair(make, faint, seed=5), [make(f"{k}.mcap", k, faint, k) for k in (10, 11, 12)]
     (found,) = diagnose(fitted, chain, test=held, reference=reference).claims
@@ -266,6 +266,16 @@ def test_without_a_reference_the_tick_of_another_clock_is_no_delay(make: Make, c
     found = diagnose(sessions, chain)
     assert found.claims == ()
     assert any("motor torques come" in note and "without a reference" in note for note in found.notes)
+
+
+def test_without_a_reference_the_wait_for_the_next_packet_is_no_delay(make: Make, chain: Chain) -> None:
+    def waiting(s: Signals) -> None:
+        old = s["time"] - 0.003
+        s["motor"][:] = np.column_stack([np.interp(old, s["time"], c) for c in s["motor"].T])
+
+    found = diagnose(pair(make, waiting), chain)
+    assert found.claims == ()
+    assert any("motor torques come" in note and "a delay below 4 ms" in note for note in found.notes)
 
 
 @pytest.mark.parametrize("encoder", ["link", "motor"])
