@@ -47,7 +47,7 @@ def test_grounds_beyond_their_range_count_as_its_end() -> None:
 
 def test_a_finding_is_told_if_one_of_its_causes_is_more_likely_right_than_none() -> None:
     assert believable({})
-    plain = replace(USUAL, rest=0.0, replaceable=0.0)
+    plain = replace(USUAL, gain=2.4, rest=0.0, replaceable=0.0)
     assert believable(plain.to_dict())
     assert not believable(replace(plain, gain=0.0, significance=3.0, felt=0.0).to_dict())
     # Even odds between two names are no doubt about both.
