@@ -20,8 +20,6 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numba.core.imputils import impl_ret_borrowed
-from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 
 from fri.errors import ConfigurationError, DataError
@@ -119,9 +117,8 @@ def fill_rigid(
 
     out : (>= C, >= 1, n, >= N) float64 C-contiguous; writes [column, 0, joint, sample] except structural zeros.
     """
-    ca, sa, d, theta, r, prismatic = chain.table
-    states = _fixed(q), _fixed(qd), _fixed(qdd)
-    _fill(*states, ca, sa, d, theta, r, prismatic, chain.gravity, _fixed(columns), out)
+    constants = (*chain.cos_sin_alpha, chain.d, chain.theta, chain.r, chain.prismatic.astype(np.float64))
+    _fill(_fixed(q), _fixed(qd), _fixed(qdd), *constants, chain.gravity, _fixed(columns), out)
 
 
 def _fixed(array: Any) -> Any:
@@ -129,18 +126,6 @@ def _fixed(array: Any) -> Any:
     view = np.ascontiguousarray(array).view()
     view.flags.writeable = False
     return view
-
-
-def _fixed_type(typing: Any, array: Any) -> Any:
-    """`_fixed` in compiled code, so that a kernel for a batch and one for a sample share their parts."""
-
-    def same(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return impl_ret_borrowed(context, builder, signature.return_type, arguments[0])
-
-    return array.copy(readonly=True)(array), same
-
-
-_as_fixed: Any = intrinsic(_fixed_type)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -221,8 +206,8 @@ def _fill_at(q, qd, qdd, table, gravity, out):  # type: ignore[no-untyped-def]
     n = q.shape[0]
     if not np.isfinite(q.sum() + qd.sum() + qdd.sum()):
         return False
-    columns = _as_fixed(np.arange(10 * n).reshape(n, 10))
-    states = _as_fixed(q.reshape(1, n)), _as_fixed(qd.reshape(1, n)), _as_fixed(qdd.reshape(1, n))
+    columns = np.arange(10 * n).reshape(n, 10)
+    states = q.reshape(1, n), qd.reshape(1, n), qdd.reshape(1, n)
     ca, sa, d, theta, r, prismatic = table[0], table[1], table[2], table[3], table[4], table[5]
     whole = out.reshape(10 * n, 1, n, 1)
     _fill(states[0], states[1], states[2], ca, sa, d, theta, r, prismatic, gravity, columns, whole)
@@ -449,7 +434,7 @@ def torque_in(chain: Chain, at: Frames, qd: Floats, qdd: Floats, inertial: Float
 
 
 def _in_frames(at: Frames, qd: Floats, qdd: Floats, bodies: Floats, chain: Chain, gravity: Floats) -> Floats:
-    (cosine, sine), (ct, st, rr) = chain.table[:2], at
+    (cosine, sine), (ct, st, rr) = chain.cos_sin_alpha, at
     out = np.empty(ct.shape)
     _newton_euler(
         ct,
@@ -548,12 +533,12 @@ def _torque_at(q, qd, qdd, table, gravity, bodies, out):  # type: ignore[no-unty
     n = q.shape[0]
     if not np.isfinite(q.sum() + qd.sum() + qdd.sum()):
         return False
-    turned = _as_fixed(table[5] > 0.0)
+    turned = table[5] > 0.0
     motion = np.empty((3, 1, n))
-    _frames(_as_fixed(q.reshape(1, n)), table[3], table[4], turned, motion)
+    _frames(q.reshape(1, n), table[3], table[4], turned, motion)
     ca, sa, d = table[0], table[1], table[2]
-    states, links = (_as_fixed(qd.reshape(1, n)), _as_fixed(qdd.reshape(1, n))), _as_fixed(bodies)
+    states = qd.reshape(1, n), qdd.reshape(1, n)
     _newton_euler(
-        motion[0], motion[1], motion[2], states[0], states[1], ca, sa, d, turned, gravity, links, out
+        motion[0], motion[1], motion[2], states[0], states[1], ca, sa, d, turned, gravity, bodies, out
     )
     return True

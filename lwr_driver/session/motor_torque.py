@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from fri.errors import ConfigurationError
@@ -226,6 +225,8 @@ def _at_times(
     """At the times of the motor torques: sensors (n, J) without their means, and an orthonormal basis of
     constant, velocity, its sign, and acceleration for each joint.
     """
+    # Not at the top: the recorder imports this module and must stay light.
+    from scipy.signal import savgol_filter
 
     def there(column: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.interp(motor.log_time, joint.log_time, column)
@@ -235,7 +236,10 @@ def _at_times(
     columns = [[constant[:, 0]] for _ in joint.names]
     width = 2 * round(0.5 * _SMOOTHING_S / joint.period_s) + 1 if len(joint) > 1 else 0
     if joint.position.shape[1] and 5 <= width < len(joint):
-        velocity, acceleration = smooth_rates(joint.position, width, joint.period_s)
+        velocity, acceleration = (
+            savgol_filter(joint.position, width, 3, deriv=order, delta=joint.period_s, axis=0)
+            for order in (1, 2)
+        )
         for place, column in enumerate(columns):
             qd = there(velocity[:, place])
             column += [qd, np.tanh(qd / _CREEP), there(acceleration[:, place])]
@@ -246,25 +250,3 @@ def _at_times(
         left, values, _ = np.linalg.svd(table, full_matrices=False)
         bases.append(left[:, values > 1e-6 * values[0]])
     return sensors - sensors.mean(axis=0), bases
-
-
-def smooth_rates(
-    position: NDArray[np.float64], width: int, period_s: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """First and second derivatives of position (n, J) by cubics fitted to `width` samples, an odd number up to n
-    (Savitzky and Golay 1964).
-
-    The filter of `scipy.signal`, whose import takes a tenth of a short experiment.
-    """
-    half = width // 2
-    place = np.arange(-half, half + 1) / half
-    fit = np.linalg.pinv(np.vander(place, 4, increasing=True))
-    middle = sliding_window_view(position, width, axis=0)
-    found = []
-    for order, factors in ((1, (1.0, 2.0, 3.0)), (2, (2.0, 6.0))):
-        # The derivative of the window's cubic at each of its samples.
-        cubic = np.vander(place, len(factors), increasing=True) * factors
-        rates = cubic @ fit[order:] / (half * period_s) ** order
-        first, last = rates[:half] @ position[:width], rates[half + 1 :] @ position[-width:]
-        found.append(np.concatenate([first, middle @ rates[half], last]))
-    return found[0], found[1]

@@ -199,14 +199,3 @@ def test_frames_with_one_joint_elsewhere_are_those_of_the_changed_positions(arm)
         )
     for one, other in zip(at, before, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_a_batch_and_a_sample_share_their_compiled_parts():
-    chain = lwr()
-    q, qd, qdd = states(chain, 3)
-    for at in (slice(None), 0):
-        regressor.rigid_regressor(chain, q[at].copy(), qd[at].copy(), qdd[at].copy())
-        regressor.torque(chain, q[at].copy(), qd[at].copy(), qdd[at].copy(), bodies(7))
-    # Each further kind of arguments takes seconds to compile.
-    for part, speed in ((regressor._fill, 1), (regressor._newton_euler, 3), (regressor._frames, 0)):
-        assert not any(kinds[speed].mutable for kinds in part.signatures)

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.signal import savgol_filter
 
 from fri.errors import ConfigurationError
 from lwr_driver.configuration import parse
 from lwr_driver.session import JointColumns
-from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder, match_torques, smooth_rates
+from lwr_driver.session.motor_torque import KrlMotorTorque, KrlTorqueDecoder, match_torques
 from tests.lwr_driver.session.session_samples import JOINTS, signals
 
 
@@ -167,11 +166,3 @@ def test_exchanged_and_wrongly_scaled_torques_are_said():
     assert [match.joint for match in matches if match.suspect] == ["A2", "E1", "A3", "A4"]
     assert "motor torque of A2 follows the torque sensor of E1" in str(matches[1])
     assert "motor torque of A3 is 160 times its torque sensor" in str(matches[3])
-
-
-@pytest.mark.parametrize(("count", "width"), [(9, 9), (60, 5), (200, 21)])
-def test_smooth_rates_are_those_of_savitzky_and_golay(count: int, width: int) -> None:
-    position = np.random.default_rng(1).normal(size=(count, 2))
-    for order, found in enumerate(smooth_rates(position, width, 0.004), 1):
-        expected = savgol_filter(position, width, 3, deriv=order, delta=0.004, axis=0)
-        np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
