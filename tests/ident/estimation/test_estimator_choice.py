@@ -144,7 +144,7 @@ def test_a_sensor_that_reads_too_much_is_found_and_stated_as_an_effect():
     effort = log.joint.effort.copy()
     effort[:, 1] *= 1.08
     changed = replace(log, joint=replace(log.joint, effort=effort))
-    found = identify(changed, chain(), MODEL_1, known=SCREENED)
+    found = identify(changed, chain(), MODEL_1)
     assert found.choice is not None
     (joint,) = found.choice.gains
     assert joint == chain().joint_names[1]
@@ -169,7 +169,7 @@ def test_an_error_common_to_most_sensors_is_one_of_the_bodies():
     effort = log.joint.effort.copy()
     effort[:, 3] *= 0.84
     changed = replace(log, joint=replace(log.joint, effort=effort))
-    found = identify(changed, chain(), MODEL_1, known=SCREENED)
+    found = identify(changed, chain(), MODEL_1)
     assert found.choice is not None
     assert list(found.choice.gains) == ["A3"]
     assert found.choice.gains["A3"][0] == pytest.approx(-0.16, abs=0.01)
@@ -189,7 +189,7 @@ def test_a_joint_that_a_gain_explains_weighs_by_what_is_left():
     effort = log.joint.effort.copy()
     effort[:, 3] *= 1.08
     changed = replace(log, joint=replace(log.joint, effort=effort))
-    found = identify(changed, chain(), MODEL_1, known=SCREENED)
+    found = identify(changed, chain(), MODEL_1)
     assert found.choice is not None
     # With the weights of the model without it: least squares, and a deviation of 0.0065.
     assert found.choice.winner.estimator == "physical"
