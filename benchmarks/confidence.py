@@ -223,7 +223,8 @@ def _fit(said: Sequence[Said], name: str, *, onward: bool, write: bool) -> None:
     weight = np.array([1.0 / max(count[one.source], _ENOUGH) for one in said])
     weight *= len(said) / weight.sum()
     path = Path(stored.__file__).with_name(name)
-    start = np.concatenate([np.atleast_1d(one) for one in stored.fitted(name)]) if onward else judged()
+    intercept, before = stored.fitted(name)
+    start = np.array([intercept, *before]) if onward else judged()
     apart = {
         ridge: held_back(said, points, right, weight, ridge, start)
         for ridge in (_ONWARD if onward else _RIDGES)

@@ -218,10 +218,10 @@ class Evidence:
         and the products (parts, P) of the columns with what they leave of its torques."""
         if self._kept_held is None:
             gram, target = self._part_gram, self._part_target
-            variances = np.diag(self.full.inverse)
+            p, pulls = self.base_count, np.zeros(len(self._scale))
+            variances = np.diag(self.full.inverse)[p:]
             # A column of zeros has none, and nothing to keep.
-            pulls = np.where(variances > 0.0, _KEPT / np.where(variances > 0.0, variances, 1.0), 0.0)
-            pulls[: self.base_count] = 0.0
+            np.divide(_KEPT, variances, out=pulls[p:], where=variances > 0.0)
             fits = [
                 self._fit(g, t, pulls=pulls, towards=self.full.values)
                 for g, t in zip(gram.sum(axis=0) - gram, target.sum(axis=0) - target, strict=True)

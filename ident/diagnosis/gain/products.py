@@ -71,9 +71,7 @@ class Products:
 
 def width_of(rows: Rows) -> int:
     """Number of columns, 0 without rows."""
-    for columns in rows.values():
-        return columns.shape[1]
-    return 0
+    return next((columns.shape[1] for columns in rows.values()), 0)
 
 
 def scale_of(squares: Floats) -> Floats:

@@ -174,7 +174,7 @@ def _unknown_delay(task: Task, claim: Claim) -> float:
     if task.arm.encoder_known or _channel(claim) != "motor":
         return 0.0
     stretches = [s for r in task.recordings for s in r.stretches if len(s.motor_time) > 1]
-    waits = [usual_step(s.motor_time) + usual_step(s.time) * s.own_clock for s in stretches]
+    waits = [usual_step(s.motor_time) + (usual_step(s.time) if s.own_clock else 0.0) for s in stretches]
     return max(waits, default=0.0)
 
 

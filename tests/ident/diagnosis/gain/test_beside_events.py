@@ -34,12 +34,8 @@ def test_gains_beside_a_moment_are_those_without_it(make: Make, chain: Chain) ->
             block = evidence.block_of("motor")
             push = np.where(at(time), 400.0, 0.0)
             # Its edge in another part, where a row of noise decides about the whole push.
-            first = int(
-                np.flatnonzero(
-                    (block >= 0) & (evidence.fold[block] != evidence.fold[block[np.argmax(push)]])
-                )[0]
-            )
-            push[first] = 0.1
+            mine = evidence.fold[block[np.argmax(push)]]
+            push[np.argmax((block >= 0) & (evidence.fold[block] != mine))] = 0.1
             evidence.replace([{("motor", 1): push[:, None]}])
         found = bench.dictionary.best(Candidate(find_effect("stribeck"), 1))
         assert found is not None
