@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Coulomb, DriveMotion, ModelStructure, Side
-from ident.rows.filters import median_step, resampled
+from ident.rows.filters import block_means, median_step, resampled
 from ident.rows.prepared import PreparedSession, TorqueChannel
 
 _CHUNK = 500
@@ -48,10 +48,7 @@ class BinnedRows:
 
 def bins(values: Floats, width: int) -> Floats:
     """Means (m, k) over `width` samples of (N, k); a remainder at the end is left out."""
-    if width == 1:
-        return values
-    count = len(values) // width
-    return values[: count * width].reshape(count, width, *values.shape[1:]).mean(axis=1)
+    return values if width == 1 else block_means(values, width)
 
 
 class Motion(NamedTuple):
