@@ -49,8 +49,10 @@ _ROUNDS = 8
 # Relative standard deviation of bodies from the URDF's; logarithm of the odds for excluding a gain.
 _STATED, _ODDS = 0.2, float(np.log(10.0))
 _OFFSETS = (-np.pi, -0.5 * np.pi, 0.5 * np.pi)
-# Candidates fitted to the end; rounds of fitting before they are compared; rows for each parameter, for motions.
-_LIKELY, _SOON, _ENOUGH = 8, 3, 6.0
+# Rounds of fitting, and how many candidates go on after them, the last ones to be fitted to the end.
+_SIEVE = (1, 32), (3, 8)
+# Rows for each parameter, for motions.
+_ENOUGH = 6.0
 
 
 @dataclass(frozen=True)
@@ -276,13 +278,15 @@ def _likely(
     """
     candidates = list(candidates)
     tries = candidates if tries is None else list(tries)
-    left = {
-        number: tries[number].mended.fit(normal, doubtful=False, rounds=_SOON).score
-        for number, one in enumerate(candidates)
-        if one.gain is one.error is None
-    }
-    least = sorted(left, key=lambda number: left[number])[:_LIKELY]
-    return [one for number, one in enumerate(candidates) if number in least or number not in left]
+    sized = {number for number, one in enumerate(candidates) if one.gain is not None or one.error is not None}
+    likely = [number for number in range(len(candidates)) if number not in sized]
+    # To make other rows costs more than to fit them.
+    for rounds, most in _SIEVE[-1:] if normal is None else _SIEVE:
+        left = {
+            number: tries[number].mended.fit(normal, doubtful=False, rounds=rounds).score for number in likely
+        }
+        likely = sorted(likely, key=lambda number: left[number])[:most]
+    return [candidates[number] for number in sorted(sized.union(likely))]
 
 
 def _motions(data: Redundancy) -> Iterator[Explanation]:
