@@ -54,11 +54,10 @@ def test_the_site_is_built_without_a_warning_and_fetches_nothing(site: Path) -> 
 @pytest.mark.slow
 def test_the_site_is_accessible_and_fits_the_window(site: Path, chrome: Browser) -> None:
     for name in SHOWN:
-        with opened(chrome, site / name) as seen:
-            for width, height in (WIDE, NARROW):
-                seen.page.set_viewport_size({"width": width, "height": height})
+        for size in (WIDE, NARROW):
+            with opened(chrome, site / name, size) as seen:
                 seen.page.wait_for_timeout(700)
-                assert flaws(seen) == [], f"{name} at {width} px"
+                assert flaws(seen) == [], f"{name} at {size[0]} px"
 
 
 def test_every_command_and_option_is_on_the_page_of_commands() -> None:

@@ -173,10 +173,8 @@ def test_the_pages_of_a_trend_are_accessible_and_fit(
         page = tmp_path / f"{name}.html"
         done = CliRunner().invoke(main, ["trend", *arm, "--store", str(store.folder), "--out", str(page)])
         assert done.exit_code == 0, done.output
-        with opened(chrome, page) as seen:
-            for width, height in (WIDE, NARROW):
-                seen.page.set_viewport_size({"width": width, "height": height})
-                seen.page.wait_for_timeout(700)
+        for size in (WIDE, NARROW):
+            with opened(chrome, page, size) as seen:
                 assert seen.page.evaluate(CONTRAST) >= 4.5
                 assert flaws(seen) == []
 
