@@ -280,7 +280,7 @@ def _likely(
     tries = candidates if tries is None else list(tries)
     sized = {number for number, one in enumerate(candidates) if one.gain is not None or one.error is not None}
     likely = [number for number in range(len(candidates)) if number not in sized]
-    # To make other rows costs more than to fit them.
+    # The rows of a motion take longer to make than to fit, so these are tried once.
     for rounds, most in _SIEVE[-1:] if normal is None else _SIEVE:
         left = {
             number: tries[number].mended.fit(normal, doubtful=False, rounds=rounds).score for number in likely
