@@ -146,11 +146,22 @@ class HealthyNull:
         least = self._scaled(candidate, score)
         return max(limit * self._shown_more(candidate, shape), least) if limit else least
 
+    def hardly_shown(self, trial: Trial) -> bool:
+        """Whether the healthy sets show so little of a trial that its limit in them tells nothing, or it is unknown how
+        much."""
+        more = self._information(trial.candidate, self.dictionary.nearest(trial))
+        return not more <= _INFORMATION[1]
+
     def _shown_more(self, candidate: Candidate, shape: str) -> float:
         """Information of these sessions on a shape over that of the healthy sets, within limits; 1 if unknown."""
+        more = self._information(candidate, shape)
+        return float(np.clip(more, *_INFORMATION)) if np.isfinite(more) else 1.0
+
+    def _information(self, candidate: Candidate, shape: str) -> float:
+        """Information of these sessions on a shape over that of the healthy sets, NaN if unknown."""
         shown, here = self.healthy.shown.get(candidate.key, {}), self.dictionary.information(candidate)
         before = shown.get(_counterpart(shape, here, shown), 0.0)
-        return float(np.clip(here.get(shape, 0.0) / before, *_INFORMATION)) if before > 0.0 else 1.0
+        return here.get(shape, 0.0) / before if before > 0.0 else np.nan
 
     def _scaled(self, candidate: Candidate, score: Score) -> float:
         """Gain by the largest usual change from day to day of a cause that is a scale, 0 for others and without a

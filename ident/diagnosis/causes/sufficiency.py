@@ -74,7 +74,8 @@ class Sufficiency:
 
     def _of_own_law(self, trial: Trial) -> bool:
         """Whether a law of a drive's speed is like the healthy arm's own one, and no larger than the error of that:
-        where the healthy sets were not as slow, its size follows from the form alone."""
+        where the healthy sets were not as slow, its size follows from the form alone. Where they were, their own gains
+        tell how well it is known."""
         candidate, law = trial.candidate, trial.candidate.effect.law
         if law is None or law.variable != "qd":
             return False
@@ -94,7 +95,7 @@ class Sufficiency:
             largest = one.rows[key][used, 0] * one.size
             alike = np.corrcoef(torque, largest)[0, 1] ** 2 > _ALIKE
             if alike and np.var(torque) <= np.var(largest):
-                return True
+                return self.null.hardly_shown(trial)
         return False
 
     def _concentration(self, trial: Trial) -> float:

@@ -17,9 +17,8 @@ if TYPE_CHECKING:  # the words about a diagnosis need a constant of this module,
 _DRAWS = 1000
 FELT_WORSE = 0.01
 """A rise of an error by a smaller share is felt by nobody, however sure: all rows share base parameters."""
-BEYOND_HEALTHY = (1.5, 2.0)
-"""Error over that which 19 of 20 healthy days stay below, hardly reached by other motions and loads: one above the
-noise, and any."""
+BEYOND_HEALTHY = 1.5
+"""Error over that which 19 of 20 healthy days stay below, hardly reached by other motions and loads."""
 # A rise beyond this counts, though it came from a single block.
 _MUCH_WORSE = 0.05
 

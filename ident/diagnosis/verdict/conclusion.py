@@ -223,7 +223,7 @@ def _left(
         # A line stands out of the spectrum below the noise of a row.
         if felt and (one.beyond_noise or r.line_hz):
             left.append(one)
-    return [*left, *_beyond_healthy(task, told.before.rms(), rms, floor, findings, told.added, left)]
+    return [*left, *_beyond_healthy(task, told.before.rms(), rms, findings, told.added, left)]
 
 
 def _simulated(task: Task, told: _Told) -> tuple[SimulationError | None, SimulationError | None]:
@@ -366,18 +366,16 @@ def _beyond_healthy(
     task: Task,
     before: Mapping[str, Floats],
     after: Mapping[str, Floats],
-    noise: Mapping[str, Floats],
     findings: Sequence[Finding],
     added: Sequence[str],
     known: Sequence[Unexplained],
 ) -> list[Unexplained]:
-    """Torques with an error far beyond that of the healthy days, of no known variable. Their noise floor is at most
-    what healthy days may leave.
+    """Torques with an error far beyond that of the healthy days, of no known variable. Their noise floor is what these
+    may leave, with room for other motions: without a repeated motion any error may pass for noise.
 
     before, after : errors of base and extended model. Less than the extension takes off an error is that of its laws. A
-    finding that the extension, `added`, does not hold explains the error of its joints. noise : of these rows; without
-    a repeated motion all of an error may pass for it, but twice that of the healthy days is none. known : remainders of
-    the same kind.
+    finding that the extension, `added`, does not hold explains the error of its joints. known : remainders of the same
+    kind.
     """
     healthy = {} if task.reference is None else task.reference.left
     open_ = [f.joints for f in findings if title({"cause": f.cause, "joints": f.joints}) not in added]
@@ -389,8 +387,7 @@ def _beyond_healthy(
     for side, usual in healthy.items():
         if side not in after:
             continue
-        least, most = BEYOND_HEALTHY
-        limit = np.clip(noise[side], least * usual, most * usual)
+        limit = BEYOND_HEALTHY * usual
         far = after[side] > limit
         far &= after[side] ** 2 - usual**2 > before[side] ** 2 - after[side] ** 2
         joints = (np.flatnonzero(far) + 1).tolist()
