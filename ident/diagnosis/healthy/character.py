@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,9 +22,7 @@ from ident.diagnosis.causes.selection import Selection
 from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.gain.rivals import likelihood
 from ident.diagnosis.gain.size import Size
-from ident.diagnosis.healthy.bench import DiagnosisBench, again_with, prepare_bench
-from ident.diagnosis.rows.nominal_arm import NominalArm
-from ident.diagnosis.rows.recording import SessionRecord
+from ident.diagnosis.healthy.bench import DiagnosisBench, again_with
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import EFFECTS, ELASTICITY, PRESLIDING, Shape, entry_of
 
@@ -103,20 +101,15 @@ class _Set:
         return found
 
 
-def character(
-    arm: NominalArm, recorded: Sequence[Sequence[SessionRecord]], settings: DiagnosisSettings
-) -> tuple[dict[str, Any], ...]:
+def character(benches: Sequence[DiagnosisBench], settings: DiagnosisSettings) -> tuple[dict[str, Any], ...]:
     """Entries of the lasting effects of a healthy arm: ripple, Stribeck friction, warmth, habits of the sensors.
 
-    recorded : sets of sessions, each of one day. Stiffness and presliding are the nominal arm's own and not listed.
+    benches : of sets of sessions, each of one day. Stiffness and presliding are the nominal arm's own and not listed.
     """
     causes = [
         cause for cause, effect in EFFECTS.items() if not (effect.event or effect.channel or effect.counted)
     ]
-    sets = [
-        _Set(prepare_bench(arm, recordings, settings, None, causes, fit_compliance=False), settings)
-        for recordings in recorded
-    ]
+    sets = [_Set(replace(bench, dictionary=bench.dictionary.of(causes)), settings) for bench in benches]
     chosen: list[tuple[Candidate, Shape]] = []
     for search in range(_SEARCHES):
         if search and chosen:

@@ -159,24 +159,31 @@ def _with_days(
     settled: SettledArm, recorded: Sequence[Sequence[SessionRecord]], settings: DiagnosisSettings
 ) -> tuple[NominalArm, list[_Day]]:
     """The settled arm with its slow friction, open delays and own effects, and the results of each set with it."""
+    of, benches, found = settled.arm, list[DiagnosisBench](), list[_Day]()
 
     def days(arm: NominalArm) -> list[_Day]:
-        return [_day(arm, recordings, settings, settled.base) for recordings in recorded]
+        nonlocal of, found
+        if not benches or not arm.acts_as(of):
+            benches.clear()
+            for recordings in recorded:
+                benches.append(prepare_bench(arm, recordings, settings, None, (), fit_compliance=False))
+            of, found = arm, [_day(bench, settings, settled.base) for bench in benches]
+        return found
 
-    found = days(settled.arm)
+    first = days(settled.arm)
     known = with_far_presliding(
-        settled.arm, [day.slow_turns for day in found], [day.coulomb for day in found]
+        settled.arm, [day.slow_turns for day in first], [day.coulomb for day in first]
     )
     for _ in range(_SETTLING):
         # The delay of a channel depends on the reversal of friction, so it is settled last.
-        found = days(known)
         open_s = {
-            side: float(np.mean([day.late[side][0] for day in found]))
+            side: float(np.mean([day.late[side][0] for day in days(known)]))
             for side in CHANNELS
             if side not in settled.late
         }
         known = later(known, open_s)
-    known = replace(known, healthy=character(known, recorded, settings))
+    days(known)
+    known = replace(known, healthy=character(benches, settings))
     return known, days(known)
 
 
@@ -219,7 +226,7 @@ def _shown(
             mean = shown.setdefault(candidate.key, {})
             for shape, value in bench.dictionary.information(candidate).items():
                 mean[shape] = mean.get(shape, 0.0) + value / len(recorded)
-        left.append(_left(known, recordings, settings, rest))
+        left.append(_left(bench, settings, rest))
         log.info("healthy set %d of %d", number + 1, len(recorded))
     return _Shown(null, shown, usual_sizes(tables), largest_left(left))
 
@@ -247,10 +254,7 @@ def _largest_losses(sets: Sequence[Sequence[Session]]) -> dict[str, float]:
     return found
 
 
-def _day(
-    arm: NominalArm, recordings: Sequence[SessionRecord], settings: DiagnosisSettings, base: BaseSet
-) -> _Day:
-    bench = prepare_bench(arm, recordings, settings, None, (), fit_compliance=False)
+def _day(bench: DiagnosisBench, settings: DiagnosisSettings, base: BaseSet) -> _Day:
     if bench.nominal.base.names != base.names:
         raise DataError(
             "the healthy sets differ in their channels or in the number of payloads, and so in their parameters; give "
@@ -282,19 +286,20 @@ def _day(
 
 
 def _left(
-    arm: NominalArm,
-    recordings: Sequence[SessionRecord],
-    settings: DiagnosisSettings,
-    reference: Reference | None,
+    bench: DiagnosisBench, settings: DiagnosisSettings, reference: Reference | None
 ) -> dict[str, Floats]:
     """Rms (n,) [Nm] by side of the set's last session with a payload of another one, as predicted from the others
     beside what differs from day to day; without such a session, of parts of the motion predicted in turn.
+
+    bench : of the set, against the reference.
     """
+    recordings, arm = bench.nominal.recordings, bench.nominal.arm
     payloads = [one.payload for one in recordings]
-    last = max((k for k, one in enumerate(payloads) if payloads.count(one) > 1), default=-1)
-    held = [replace(one, test=k == last) for k, one in enumerate(recordings)]
-    bench = prepare_bench(arm, held, settings, reference, (), fit_compliance=False)
-    nuisance = select(bench.dictionary, settings, None).nuisance_rows
+    last = max((k for k, one in enumerate(payloads) if payloads.count(one) > 1), default=None)
+    if last is not None:
+        held = [replace(one, test=k == last) for k, one in enumerate(recordings)]
+        bench = prepare_bench(arm, held, settings, reference, (), fit_compliance=False)
+    nuisance = select(bench.dictionary.of(()), settings, None).nuisance_rows
     return held_out(bench.evidence, nuisance).rms()
 
 

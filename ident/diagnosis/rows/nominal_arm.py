@@ -13,6 +13,7 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coupling, EncoderSide
 from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of
 from ident.effects.motion import dahl
+from ident.rows.content import content
 from ident.rows.encoder_side import USUAL_TWIST_RAD
 
 Floats = NDArray[np.float64]
@@ -84,6 +85,16 @@ class NominalArm:
     def delays(self) -> dict[str, float]:
         """Delays of the channels [s], as in the signal settings of a model."""
         return {"motor_delay_s": self.motor_delay_s, "joint_delay_s": self.joint_delay_s}
+
+    def acts_as(self, other: NominalArm) -> bool:
+        """Whether the rows of a session are the same with another arm."""
+        return content(self._acting) == content(other._acting)
+
+    @property
+    def _acting(self) -> NominalArm:
+        """The arm without a longer distance over which no friction turns."""
+        turns = self.far_share is not None and self.far_share.any()
+        return self if turns else replace(self, far=None, far_share=None)
 
     @property
     def usual_length(self) -> float:
