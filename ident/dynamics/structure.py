@@ -305,6 +305,11 @@ class ModelStructure:
             return link, position
         return (self.chain.n - 1, position) if self.payload_link(payload) == link else None
 
+    def of_drive(self, column: int) -> bool:
+        """Whether a column follows the motion of the motors where it is not that of the links."""
+        link, place = divmod(int(column), len(PER_LINK))
+        return link >= self.n_links or PER_LINK[place] not in (*INERTIAL, *_JOINT_TERMS)
+
     # ---- the stacked matrix ----
 
     @cached_property
@@ -322,7 +327,7 @@ class ModelStructure:
                 link, place = divmod(column, len(PER_LINK))
                 if link < self.n_links and place < len(INERTIAL):
                     continue
-                of_link = link < self.n_links and PER_LINK[place] in _JOINT_TERMS
+                of_link = not self.of_drive(column)
                 for s, side in enumerate(sides):
                     for joint in range(self.chain.n):
                         atom = self.signal_of(column, side, joint)
@@ -366,7 +371,7 @@ class ModelStructure:
         sources, entries = self._plan(wanted.tobytes(), payload, chosen)
         # Difference rows have no rigid part and are never preceded by other sides (side order).
         rigid_sides = [s for s, side in enumerate(chosen) if side != "difference"]
-        if rigid_sides:
+        if rigid_sides and sources:
             first = np.full((n, len(INERTIAL)), -1, dtype=np.int64)
             for c, source in sources.items():
                 if first[source] < 0:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import math
 import mmap
 import os
 import resource
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 LEAST_BYTES = 4 * 2**20
 """Smaller arrays stay in memory, up to `_MOST_BYTES` of them."""
@@ -96,22 +97,30 @@ class Arena:
         """The same array in a file; a small one as it is."""
         if array.nbytes < _SMALL_BYTES:
             return array
-        with self._lock:
-            if self._held is None or self._used + array.nbytes > len(self._held):
-                size = max(self._next, array.nbytes)
-                try:
-                    with tempfile.TemporaryFile(prefix="lwr-") as file:
-                        os.posix_fallocate(file.fileno(), 0, size)
-                        self._held, self._used = mmap.mmap(file.fileno(), size), 0
-                except OSError:
-                    # No room in the temporary folder: memory has to do.
-                    return array
-                self._next = min(2 * size, _ARENA_BYTES[1])
-                _watched(self._held)
-            kept = np.ndarray(array.shape, array.dtype, self._held, self._used)
-            self._used += -(-array.nbytes // 64) * 64
+        kept = self.room(array.shape, array.dtype)
         kept[...] = array
         return kept
+
+    def room(self, shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray[Any]:
+        """An array without content, in a file unless it is small."""
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        if size < _SMALL_BYTES:
+            return np.empty(shape, dtype)
+        with self._lock:
+            if self._held is None or self._used + size > len(self._held):
+                whole = max(self._next, size)
+                try:
+                    with tempfile.TemporaryFile(prefix="lwr-") as file:
+                        os.posix_fallocate(file.fileno(), 0, whole)
+                        self._held, self._used = mmap.mmap(file.fileno(), whole), 0
+                except OSError:
+                    # No room in the temporary folder: memory has to do.
+                    return np.empty(shape, dtype)
+                self._next = min(2 * whole, _ARENA_BYTES[1])
+                _watched(self._held)
+            found = np.ndarray(shape, dtype, self._held, self._used)
+            self._used += -(-size // 64) * 64
+        return found
 
 
 class _Few:

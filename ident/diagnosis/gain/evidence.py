@@ -12,12 +12,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fri.errors import DataError
+from ident.diagnosis.gain.fitted_rows import FittedRows
 from ident.diagnosis.gain.products import (
     Fit,
     Floats,
@@ -39,7 +38,6 @@ from ident.diagnosis.rows.nominal import Nominal
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.estimators.estimate import chi_square_tail
 from ident.estimators.physical import lacking_bodies
-from lwr_driver.session.spool import Arena
 
 # Least share of a column's power left by base parameters without the prior, where the prior is a drawing.
 _OWN_SHARE = 3e-3
@@ -60,7 +58,7 @@ class Evidence:
     sigma : noise of a row [Nm] by side, (n,). variance_inflation : by side, (n,), of correlated noise.
     prior : precision (p, p) and values (p,) of the base parameters, from a reference. Where they are `compared`,
     causes otherwise absorbed by the base parameters show as well.
-    floor : repeatability of a row [Nm] by side, (n,); default sigma.
+    floor : repeatability of a row [Nm] by side, (n,); default sigma. fitted_rows : of the arm, made with another noise.
     """
 
     def __init__(
@@ -73,31 +71,31 @@ class Evidence:
         *,
         compared: bool = True,
         floor: Mapping[str, Floats] | None = None,
+        fitted_rows: FittedRows | None = None,
     ) -> None:
         self.settings, self.prior, self.compared = settings, prior, compared
-        self._arena = Arena()
         self.floor = dict(sigma if floor is None else floor)
         self.nominal = nominal
         self.sigma = {side: np.array(value) for side, value in sigma.items()}
         self.variance_inflation = {side: np.array(value) for side, value in variance_inflation.items()}
-        self._layout(nominal)
-        self.mask: dict[Key, Floats] = {}
+        self.fitted_rows = fitted = fitted_rows or FittedRows(nominal, settings)
+        self.blocks, self.block_session, self.block_start = (
+            fitted.blocks,
+            fitted.block_session,
+            fitted.block_start,
+        )
+        self.fold, self.parts = fitted.fold, fitted.parts
+        self._block, self._order, self._starts = fitted.block, fitted.order, fitted.starts
+        self._columns = {key: own.columns for key, own in fitted.keys.items()}
+        self._acting = {key: own.acting for key, own in fitted.keys.items()}
+        self._targets = {key: own.target for key, own in fitted.keys.items()}
+        self.mask = {key: own.mask for key, own in fitted.keys.items()}
         self._weights: dict[Key, float] = {}
         self._independent: dict[Key, float] = {}
-        self._columns: dict[Key, Floats] = {}
-        self._acting: dict[Key, NDArray[np.int64]] = {}
-        self._targets: dict[Key, Floats] = {}
-        for side, rows in nominal.rows.items():
-            for j in range(nominal.arm.chain.n):
-                key, keep = (side, j), rows.valid[:, j] & ~rows.test
-                wide = np.where(keep[:, None], rows.matrix[j], 0.0)
-                self._weights[key] = 1.0 / (self.sigma[side][j] ** 2 * self.variance_inflation[side][j])
-                # Most base columns do not act on most joints.
-                self._acting[key] = np.flatnonzero(np.any(wide != 0.0, axis=0))
-                self._columns[key] = self._arena.keep(wide[self._order[side]][:, self._acting[key]])
-                self._targets[key] = np.where(keep, rows.target[:, j], 0.0)[self._order[side], None]
-                self.mask[key] = keep[self._order[side], None].astype(float)
-                self._independent[key] = float(keep.sum()) / float(self.variance_inflation[side][j])
+        for (side, j), own in fitted.keys.items():
+            inflation = float(self.variance_inflation[side][j])
+            self._weights[side, j] = 1.0 / (float(self.sigma[side][j]) ** 2 * inflation)
+            self._independent[side, j] = own.count / inflation
         self.base_count = len(nominal.base)
         self.extra: list[Rows] = []
         self._known: dict[int, tuple[Rows, dict[Key, Floats], Products]] = {}
@@ -107,55 +105,6 @@ class Evidence:
         self._base_products()
         self._gram()
 
-    # ---- layout ----
-
-    def _layout(self, nominal: Nominal) -> None:
-        """Blocks of time, the same on all sides, and the part of the motion of each."""
-        settings = self.settings
-        numbers: dict[tuple[int, int], int] = {}
-        folds: list[int] = []
-        start = {r.number: r.start_s for r in nominal.recordings}
-        period = {r.number: r.period_s for r in nominal.recordings}
-        # A motion without repetition gives half as long a block, for enough of them.
-        parts = {r.number: (2.0 if r.repeats else 4.0) * settings.folds for r in nominal.recordings}
-        length = {r.number: min(settings.block_s, r.period_s / parts[r.number]) for r in nominal.recordings}
-        ids: dict[str, NDArray[np.int64]] = {}
-        for side, rows in nominal.rows.items():
-            found = np.full(len(rows.time), -1)
-            for session in np.unique(rows.session[~rows.test]).tolist():
-                mine = np.flatnonzero(~rows.test & (rows.session == session))
-                since = rows.time[mine] - start[session]
-                within = (since / length[session]).astype(np.int64)
-                blocks, first, place = np.unique(within, return_index=True, return_inverse=True)
-                known = np.empty(len(blocks), dtype=np.int64)
-                # In the order of time, as they are met.
-                for k in np.argsort(first, kind="stable"):
-                    block = (session, int(blocks[k]))
-                    if block not in numbers:
-                        numbers[block] = len(numbers)
-                        phase = since[first[k]] % period[session]
-                        folds.append(int(phase / length[session]) % settings.folds)
-                    known[k] = numbers[block]
-                found[mine] = known[place]
-            ids[side] = found
-        self.blocks = len(numbers)
-        self.block_session = np.array([session for session, _ in numbers], dtype=np.int64)
-        self.block_start = np.array([start[k] + b * length[k] for k, b in numbers])
-        self.fold = np.array(folds, dtype=np.int64)
-        self.parts = (np.unique(self.fold)[:, None] == self.fold).astype(float)
-        if len(set(folds)) < 2:
-            raise DataError("the sessions are too short to hold a part of them back; record at least 5 s")
-        self._block = ids
-        self._order: dict[str, slice | NDArray[np.int64]] = {}
-        self._starts: dict[str, NDArray[np.int64]] = {}
-        for side, found in ids.items():
-            fitted = np.flatnonzero(found >= 0)
-            order = fitted[np.argsort(found[fitted], kind="stable")]
-            even = len(order) > 0 and bool(np.all(np.diff(order) == 1))
-            self._order[side] = slice(int(order[0]), int(order[-1]) + 1) if even else order
-            counts = np.bincount(found[fitted], minlength=self.blocks)
-            self._starts[side] = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-
     # ---- products ----
 
     def _base_products(self) -> None:
@@ -163,16 +112,11 @@ class Evidence:
         self._base_gram = np.zeros((self.blocks, p, p))
         self._base_target = np.zeros((self.blocks, p))
         self.energy = np.zeros(self.blocks)
-        for key, matrix in self._columns.items():
-            weight, t = self._weights[key], self._targets[key]
-            on, starts = self._acting[key], self._starts[key[0]]
-            gram, target = np.empty((self.blocks, len(on), len(on))), np.empty((self.blocks, len(on)))
-            for block, (first, last) in enumerate(pairwise(starts.tolist())):
-                own, torque = matrix[first:last], t[first:last, 0]
-                gram[block], target[block] = own.T @ own, own.T @ torque
-                self.energy[block] += weight * float(torque @ torque)
-            self._base_gram[:, on[:, None], on] += weight * gram
-            self._base_target[:, on] += weight * target
+        for key, own in self.fitted_rows.keys.items():
+            weight, on = self._weights[key], own.acting
+            self.energy += weight * own.energy
+            self._base_gram[:, on[:, None], on] += weight * own.gram
+            self._base_target[:, on] += weight * own.moment
 
     def _places(self) -> Iterator[tuple[slice, Rows]]:
         """The further columns with their places behind the base."""
@@ -283,9 +227,9 @@ class Evidence:
             for rows in missing:
                 known.crossed[id(rows)] = sums[:, :, place : place + width_of(rows)]
                 place += width_of(rows)
-        further = partial(self._further, columns, list(self.extra))
+        further = partial(self._further, columns, self.extra)
         sums = np.concatenate([known.crossed[id(rows)] for rows in self.extra], axis=2)
-        return replace(known, further=further, further_sums=sums, plain=known)
+        return Products(known.alone, known.own, known.target, known.parts, further, sums, plain=known)
 
     def _further(self, columns: _Columns, groups: Sequence[Rows]) -> Floats:
         """Products (blocks, k, w) of padded columns with groups of further columns."""

@@ -71,7 +71,9 @@ class Products:
 
 def width_of(rows: Rows) -> int:
     """Number of columns, 0 without rows."""
-    return next((columns.shape[1] for columns in rows.values()), 0)
+    for columns in rows.values():
+        return int(columns.shape[1])
+    return 0
 
 
 def scale_of(squares: Floats) -> Floats:

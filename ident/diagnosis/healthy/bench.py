@@ -11,6 +11,7 @@ from ident.diagnosis.causes.candidates import Dictionary, Trial
 from ident.diagnosis.causes.selection import Selection
 from ident.diagnosis.causes.tolerances import Deviation, gain_rows
 from ident.diagnosis.gain.evidence import Evidence
+from ident.diagnosis.gain.fitted_rows import FittedRows
 from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.healthy.reference import Reference, joint_of, symbol_of
 from ident.diagnosis.rows.noise import misfit, noise_floor, repeatability
@@ -148,7 +149,7 @@ def prepare_bench(
     std: Floats | None = None
     for _ in range(rounds):
         nominal.refine(evidence.full.values[: len(base)])
-        evidence, repeatable = _evidence(nominal, settings, prior, reference)
+        evidence, repeatable = _evidence(nominal, settings, prior, reference, evidence)
         if fitted:
             change, std = _compliance_step(nominal, evidence, arm)
             if np.all(np.abs(change) < 0.03 * arm.compliance):
@@ -184,13 +185,16 @@ def _evidence(
     settings: DiagnosisSettings,
     prior: tuple[Floats, Floats] | None,
     healthy: Reference | None = None,
+    before: Evidence | None = None,
 ) -> tuple[Evidence, bool]:
     """Evidence with the noise of a first fit, and no more than on the `healthy` arm. Without one the prior keeps base
     parameters with weak excitation near the drawing; repeated periods make their uncertainty known, so it is left out.
+    before : with other predictions of the same arm.
     """
     compared = healthy is not None
     one = {side: np.ones(nominal.arm.chain.n) for side in nominal.rows}
-    first = Evidence(nominal, settings, one, one)
+    rows = FittedRows(nominal, settings, None if before is None else before.fitted_rows)
+    first = Evidence(nominal, settings, one, one, fitted_rows=rows)
     if compared and len(nominal.rows) == 2:
         # Gains of other days are no noise.
         first.replace(list(gain_rows(Dictionary(nominal, first, ())).values()))
@@ -203,7 +207,10 @@ def _evidence(
             inflation[side] = np.where(quiet, healthy.correlated[side], inflation[side])
     if repeatable and not compared:
         prior = None
-    return Evidence(nominal, settings, sigma, inflation, prior, compared=compared, floor=floor), repeatable
+    found = Evidence(
+        nominal, settings, sigma, inflation, prior, compared=compared, floor=floor, fitted_rows=rows
+    )
+    return found, repeatable
 
 
 def _noise(
@@ -308,7 +315,14 @@ def again_with(
         inflation[side][joint] = min(new_inflation[side][joint], most / sigma[side][joint] ** 2)
     nominal.refine(evidence.full.values[: evidence.base_count])
     again = Evidence(
-        nominal, settings, sigma, inflation, evidence.prior, compared=evidence.compared, floor=floor
+        nominal,
+        settings,
+        sigma,
+        inflation,
+        evidence.prior,
+        compared=evidence.compared,
+        floor=floor,
+        fitted_rows=FittedRows(nominal, settings, evidence.fitted_rows),
     )
     return DiagnosisBench(nominal, again, Dictionary(nominal, again, causes), bench.repeatable)
 

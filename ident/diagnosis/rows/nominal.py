@@ -102,6 +102,9 @@ class Nominal:
         default_factory=dict, init=False, repr=False
     )
     _pieces: dict[tuple[object, ...], list[list[Piece]]] = field(default_factory=dict, init=False, repr=False)
+    _made: dict[str, tuple[Sequence[ArmMotion], SideRows]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def __post_init__(self) -> None:
         self.motions = self.motions or in_order([self._motion(r, s, s.effort) for r, s in self.stretches])
@@ -439,6 +442,22 @@ class Nominal:
         return found
 
     def _side_rows(self, side: str) -> SideRows:
+        """The rows of a side. Where the links move as before, what follows from their motion stays."""
+        of, before = self._made.get(side, ((), None))
+        same = [(a.q is b.q, a.qd is b.qd, a.qdd is b.qdd) for a, b in zip(of, self.motions, strict=False)]
+        kept = before if np.all(same) else None
+        if kept is None or side == "motor":
+            kept = self._made_anew(side, kept)
+        self._made[side] = self.motions, kept
+        return kept
+
+    def _made_anew(self, side: str, before: SideRows | None) -> SideRows:
+        """The rows of a side, in place of those `before` where only the drives move otherwise."""
+        columns = np.asarray(self.base.columns)
+        places = np.arange(len(columns))
+        if before is not None:
+            places = np.flatnonzero([self.structure.of_drive(column) for column in columns])
+        make_matrix = partial(self._used_matrix, columns[places], side)
         parts: list[tuple[Any, ...]] = []
         matrices: list[Callable[[], Floats]] = []
         for motion, (recording, stretch) in zip(self.motions, self.stretches, strict=True):
@@ -454,7 +473,7 @@ class Nominal:
             dt = width * usual_step(stamp)
             stamps = self._stamps(side, stretch)
             chosen = self._windows(recording, stamps)
-            matrices.append(partial(self._used_matrix, side, motion, recording, stretch, chosen))
+            matrices.append(partial(make_matrix, motion, recording, stretch, chosen))
             torque = self._slow(side, bins(target, width), dt)
             if self.band_hz[side] is not None:
                 # The columns pass through the same low-pass, so rounded reversals cancel; only longer rests are
@@ -471,29 +490,31 @@ class Nominal:
             parts.append((torque[chosen], (valid & self.moving)[chosen], session, stamps[chosen], test))
         others = [np.concatenate(part) for part in zip(*parts, strict=True)]
         # One stretch in memory at a time.
-        matrix = Arena().keep(np.empty((self.arm.chain.n, len(others[0]), len(self.base))))
-        first = 0
+        shape = (self.arm.chain.n, len(others[0]), len(self.base))
+        matrix = Arena().room(shape) if before is None else before.matrix
+        first, own = 0, slice(None) if before is None else places
         for (torque, *_), make in zip(parts, matrices, strict=True):
-            matrix[:, first : first + len(torque)] = make()
+            matrix[:, first : first + len(torque), own] = make()
             first += len(torque)
         return SideRows(matrix, *others)
 
     def _used_matrix(
         self,
+        columns: NDArray[np.int64],
         side: str,
         motion: ArmMotion,
         recording: SessionRecord,
         stretch: RecordStretch,
         chosen: NDArray[np.bool_],
     ) -> Floats:
-        """(n, m, p) regressor of the `chosen` rows of one stretch and side."""
+        """(n, m, k) regressor of some columns in the `chosen` rows of one stretch and side."""
         stamp, delay, width = self._sampling(side, stretch)
         at = stamp - delay
         if self.band_hz[side] is None:
             # The rows in use alone.
             used = at[: len(at) // width * width].reshape(-1, width)[chosen].reshape(-1)
-            return self._matrix(side, motion, recording, stretch.time, used, width)
-        wide = self._matrix(side, motion, recording, stretch.time, at, width)
+            return self._matrix(columns, side, motion, recording, stretch.time, used, width)
+        wide = self._matrix(columns, side, motion, recording, stretch.time, at, width)
         return np.stack([self._slow(side, table, width * usual_step(stamp)) for table in wide])[:, chosen]
 
     def _moves(self, stretch: RecordStretch, speed: Floats, at: Floats, *, drives: bool) -> NDArray[np.bool_]:
@@ -520,9 +541,16 @@ class Nominal:
         return found
 
     def _matrix(
-        self, side: str, motion: ArmMotion, recording: SessionRecord, grid: Floats, at: Floats, width: int
+        self,
+        columns: NDArray[np.int64],
+        side: str,
+        motion: ArmMotion,
+        recording: SessionRecord,
+        grid: Floats,
+        at: Floats,
+        width: int,
     ) -> Floats:
-        """(n, m, p) regressor of one stretch and side in rows, the drives at the motors' own motion."""
+        """(n, m, k) regressor of some columns of one stretch and side in rows, the drives at the motors' own motion."""
         exact = _on_grid(grid, at) if len(at) else None
         signals = (
             motion.q,
@@ -536,7 +564,7 @@ class Nominal:
         chosen: Side = "motor" if side == "motor" else "joint"
         return binned_regressor(
             self.structure,
-            np.asarray(self.base.columns),
+            columns,
             Motion(q, qd, qdd, DriveMotion(*drive) if side == "motor" else None),
             recording.payload,
             chosen,
