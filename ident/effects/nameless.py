@@ -43,8 +43,13 @@ _FACTOR = re.compile(r"sign\(qd([1-9]\d*)\)|load([1-9]\d*)")
 def hats(values: Floats, low: float, high: float) -> Floats:
     """Piecewise linear functions (N, 7) of values (N,), with knots evenly from `low` to `high`, constant beyond."""
     found = np.zeros((len(values), KNOTS))
-    _add_hats(np.clip((values - low) / (high - low), 0.0, 1.0) * (KNOTS - 1), found)
+    _add_hats(knot_places(values, low, high), found)
     return found
+
+
+def knot_places(values: Floats, low: float, high: float) -> Floats:
+    """Places (N,) of values among the knots, from 0 to 6."""
+    return np.asarray(np.clip((values - low) / (high - low), 0.0, 1.0) * (KNOTS - 1), dtype=np.float64)
 
 
 @njit(cache=True, nogil=True)

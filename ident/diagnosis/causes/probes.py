@@ -23,7 +23,7 @@ from ident.diagnosis.gain.products import Floats, Key, Products, Rows
 from ident.diagnosis.gain.score import Score
 from ident.diagnosis.rows.nominal import TRAVEL_RAD
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.effects import NAMELESS, Column
+from ident.effects import NAMELESS
 from ident.effects.motion import ArmMotion
 from ident.effects.nameless import KNOTS, hats
 from ident.rows.filters import median_step
@@ -367,17 +367,12 @@ def groups(
         of = name.rstrip("0123456789")
         if of in ("load", "qdd") and name != f"{of}{joint + 1}":
             continue
-        names = [name]
-        # A function of the own speed has both signs by itself.
-        names += [] if name == f"qd{joint + 1}" else [f"{name} sign(qd{joint + 1})"]
-        names += [f"{name} load{joint + 1}"] if of == "q" else []
-
-        def made(motion: ArmMotion, curve: Curve = curve, names: list[str] = names) -> list[Column]:
-            parts = curve.hats(motion)
-            factors = motion.direction[:, joint : joint + 1], motion.joint_torque[:, joint : joint + 1]
-            scaled = [parts, *(parts * factor for factor, _ in zip(factors, names[1:], strict=False))]
-            return [Column(motor=one) if side == "motor" else Column(joint=one) for one in scaled]
-
-        columns = dictionary.nominal.columns(made, [side])[side]
-        found |= {one: {(side, joint): values} for one, values in zip(names, columns, strict=True)}
+        factors: dict[str, Callable[[ArmMotion], Floats]] = {name: lambda m: np.ones(len(m.time))}
+        if name != f"qd{joint + 1}":
+            # A function of the own speed has both signs by itself.
+            factors[f"{name} sign(qd{joint + 1})"] = lambda m: m.direction[:, joint]
+        if of == "q":
+            factors[f"{name} load{joint + 1}"] = lambda m: m.joint_torque[:, joint]
+        columns = dictionary.nominal.functions(side, curve.of, curve.low, curve.high, [*factors.values()])
+        found |= {one: {(side, joint): values} for one, values in zip(factors, columns, strict=True)}
     return found

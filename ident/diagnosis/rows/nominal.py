@@ -31,6 +31,7 @@ from ident.dynamics.base_set import BaseSet, numeric_base
 from ident.dynamics.structure import Condition, DriveMotion, ModelStructure, Side
 from ident.effects import Column, effects_torque
 from ident.effects.motion import ArmMotion, in_order
+from ident.effects.nameless import KNOTS, knot_places
 from ident.effects.springs import Springs
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.binned import Motion, binned_regressor, bins
@@ -296,15 +297,8 @@ class Nominal:
         values on a side is left out there.
         """
         sides = tuple(side for side in self.sides if sides is None or side in sides)
-        key = (*sides, self.arm.motor_delay_s, self.arm.joint_delay_s)
-        if key not in self._pieces:
-            self._pieces[key] = [
-                list(self._cut(sides, number, *pair)) for number, pair in enumerate(self.stretches)
-            ]
         found: dict[str, dict[int, list[Floats]]] = {side: {} for side in sides}
-        for number, (pieces, (recording, stretch)) in enumerate(
-            zip(self._pieces[key], self.stretches, strict=True)
-        ):
+        for number, pieces in enumerate(self._parts(sides)):
             rows: dict[tuple[str, int], Floats] = {}
             for piece in pieces:
                 for k, one in enumerate(made(piece.motion)):
@@ -313,17 +307,60 @@ class Nominal:
                         if values is None:
                             continue
                         if (side, k) not in rows:
-                            count = self._operator(side, number, recording, stretch)[0].shape[0]
-                            rows[side, k] = np.zeros((count, *values.shape[1:]))
+                            rows[side, k] = self._no_rows(side, number, values.shape[1:])
                         own.add(values, rows[side, k])
             for (side, k), values in rows.items():
-                if self.band_hz[side] is not None:
-                    dt = self._operator(side, number, recording, stretch)[1]
-                    chosen = self._windows(recording, self._stamps(side, stretch))
-                    wide = self._slow(side, values.reshape(len(values), -1), dt)[chosen]
-                    values = wide.reshape(len(wide), *values.shape[1:])
-                found[side].setdefault(k, []).append(values)
+                found[side].setdefault(k, []).append(self._used(side, number, values))
         return {side: [np.concatenate(parts) for parts in of.values()] for side, of in found.items()}
+
+    def functions(
+        self,
+        side: str,
+        of: Callable[[ArmMotion], Floats],
+        low: float,
+        high: float,
+        factors: Sequence[Callable[[ArmMotion], Floats]],
+    ) -> list[Floats]:
+        """Rows (m, 7) of the hat functions of a variable, see `ident.effects.nameless.hats`, times each of some
+        factors.
+
+        of, factors : variable and factors (N,) of a motion.
+        """
+        found: list[list[Floats]] = [[] for _ in factors]
+        for number, pieces in enumerate(self._parts((side,))):
+            if not _holds(*self.stretches[number], side):
+                continue
+            rows = [self._no_rows(side, number, (KNOTS,)) for _ in factors]
+            for piece in pieces:
+                place = knot_places(of(piece.motion), low, high)
+                for factor, values in zip(factors, rows, strict=True):
+                    piece.gathers[side].add_hats(place, np.ascontiguousarray(factor(piece.motion)), values)
+            for one, values in zip(found, rows, strict=True):
+                one.append(self._used(side, number, values))
+        return [np.concatenate(one) for one in found]
+
+    def _parts(self, sides: Sequence[str]) -> list[list[Piece]]:
+        """The parts of each motion, made once."""
+        key = (*sides, self.arm.motor_delay_s, self.arm.joint_delay_s)
+        if key not in self._pieces:
+            self._pieces[key] = [
+                list(self._cut(sides, number, *pair)) for number, pair in enumerate(self.stretches)
+            ]
+        return self._pieces[key]
+
+    def _no_rows(self, side: str, number: int, shape: tuple[int, ...]) -> Floats:
+        """Zeros (m, ...) in the rows of a motion."""
+        return np.zeros((self._operator(side, number, *self.stretches[number])[0].shape[0], *shape))
+
+    def _used(self, side: str, number: int, values: Floats) -> Floats:
+        """The rows in use of the rows (m, ...) of a motion, low-passed as the torques were."""
+        if self.band_hz[side] is None:
+            return values
+        recording, stretch = self.stretches[number]
+        dt = self._operator(side, number, recording, stretch)[1]
+        chosen = self._windows(recording, self._stamps(side, stretch))
+        wide = self._slow(side, values.reshape(len(values), -1), dt)[chosen]
+        return wide.reshape(len(wide), *values.shape[1:])
 
     def _cut(
         self, sides: Sequence[str], number: int, recording: SessionRecord, stretch: RecordStretch

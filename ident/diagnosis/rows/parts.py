@@ -30,6 +30,12 @@ class Gather:
         else:
             _add_many(self.starts, self.samples, self.weights, values, here)
 
+    def add_hats(self, place: Floats, factor: Floats, rows: Floats) -> None:
+        """Add what hat functions times a factor (N,) contribute to rows (m, knots), at the places (N,) between knots;
+        two of them are not zero."""
+        here = rows[self.first : self.first + len(self.starts) - 1]
+        _add_hats(self.starts, self.samples, self.weights, place, factor, here)
+
 
 @dataclass(frozen=True, eq=False)
 class Piece:
@@ -63,3 +69,15 @@ def _add_many(starts, samples, weights, values, rows):  # type: ignore[no-untype
         for k in range(starts[row], starts[row + 1]):
             for own in range(values.shape[1]):
                 rows[row, own] += weights[k] * values[samples[k], own]
+
+
+@njit(cache=True, nogil=True)
+def _add_hats(starts, samples, weights, place, factor, rows):  # type: ignore[no-untyped-def]
+    last = rows.shape[1] - 2
+    for row in range(len(starts) - 1):
+        for k in range(starts[row], starts[row + 1]):
+            at = samples[k]
+            knot = min(int(place[at]), last)
+            share = place[at] - knot
+            rows[row, knot] += weights[k] * ((1.0 - share) * factor[at])
+            rows[row, knot + 1] += weights[k] * (share * factor[at])

@@ -16,6 +16,7 @@ from ident.diagnosis.outcome.signatures import signature_bench
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.kinematics import Chain
 from ident.effects import EFFECTS
+from ident.effects.nameless import hats
 from lwr_driver.session import Session
 
 MIDDLE_S, LENGTH_S, SIZE_NM = 8.0, 3.0, 0.12
@@ -96,6 +97,24 @@ def test_columns_by_parts_are_those_of_whole_motions(make: Callable[..., Session
                         expected = nominal.reduce(side, signals)
                         scale = np.abs(expected).max()
                         np.testing.assert_allclose(parts[side][k], expected, rtol=1e-9, atol=1e-9 * scale)
+
+
+def test_hat_functions_in_rows_are_those_of_the_motion(make: Callable[..., Session], chain: Chain) -> None:
+    nominal = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain).nominal
+    whole = [hats(motion.q[:, 1], -0.5, 0.7) for motion in nominal.motions]
+    loads = [motion.joint_torque[:, 2] for motion in nominal.motions]
+    for side in nominal.rows:
+        plain, loaded = nominal.functions(
+            side,
+            lambda motion: motion.q[:, 1],
+            -0.5,
+            0.7,
+            [lambda m: np.ones(len(m.time)), lambda m: m.joint_torque[:, 2]],
+        )
+        times = [hat * load[:, None] for hat, load in zip(whole, loads, strict=True)]
+        for mine, expected in ((plain, whole), (loaded, times)):
+            rows = nominal.reduce(side, expected)
+            np.testing.assert_allclose(mine, rows, rtol=1e-9, atol=1e-12 * np.abs(rows).max())
 
 
 def test_a_dictionary_of_fewer_causes_keeps_its_columns(make: Callable[..., Session], chain: Chain) -> None:
