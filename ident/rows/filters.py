@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import prod
 from typing import Annotated, Literal
 
@@ -376,7 +376,8 @@ class ParallelFilter:
     def coverage(self) -> Floats:
         """Share (K,) of the kernel's absolute area covered by samples, less than 1 at a gap or an end."""
         whole = np.linspace(-self.half_width, self.half_width, 2001)
-        area = float(np.mean(np.abs(self._kernel(np.abs(whole))))) * 2.0 * self.half_width
+        ones = np.ones(len(whole))
+        area = float(np.mean(np.abs(_kernel(np.zeros(1), whole, ones, *self._table)))) * 2.0 * self.half_width
         result = np.empty(len(self.outputs))
         for rows, _, kernel in self._kernels():
             result[rows] = np.abs(kernel).sum(axis=1) / area
@@ -416,22 +417,49 @@ class ParallelFilter:
             key = (len(outputs), high - low, round(1e9 * (outputs[0] - self.times[low]))) if inner else None
             kernel = known.get(key) if key is not None else None
             if kernel is None:
-                distance = np.abs(outputs[:, None] - self.times[None, low:high])
-                kernel = self._kernel(distance) * weight[low:high]
+                kernel = _kernel(outputs, self.times[low:high], weight[low:high], *self._table)
                 if key is not None:
                     known[key] = kernel
             yield slice(first, first + len(outputs)), slice(low, high), kernel
 
-    @cached_property
+    @property
     def _table(self) -> tuple[Floats, Floats]:
-        time = np.linspace(0.0, self.half_width, 4097)
-        return time, np.sinc(2.0 * self.cutoff_hz * time) * _kaiser(
-            time / self.half_width, self.attenuation_db
-        )
+        return _sinc(self.cutoff_hz, self.attenuation_db)
 
-    def _kernel(self, distance: Floats) -> Floats:
-        time, value = self._table
-        return np.interp(distance, time, value, right=0.0)
+
+@lru_cache(maxsize=64)
+def _sinc(cutoff_hz: float, attenuation_db: float) -> tuple[Floats, Floats]:
+    """Distances (4097,) [s] from the middle of a kernel, evenly up to its half width, and its values there."""
+    half = half_width(cutoff_hz, attenuation_db)
+    time = np.linspace(0.0, half, 4097)
+    return time, np.sinc(2.0 * cutoff_hz * time) * _kaiser(time / half, attenuation_db)
+
+
+@njit(cache=True, nogil=True)
+def _kernel(outputs, times, weights, distance, value):  # type: ignore[no-untyped-def]
+    """Weighted values (K, m) of a kernel at the distances of samples from outputs; zero beyond its table."""
+    found = np.zeros((len(outputs), len(times)))
+    last = len(distance) - 1
+    if distance[last] <= 0.0:
+        return found
+    each = last / distance[last]
+    for row in range(len(outputs)):
+        for k in range(len(times)):
+            here = abs(outputs[row] - times[k])
+            if not here <= distance[last]:
+                continue
+            # The table is even but for rounding.
+            at = min(int(here * each), last - 1)
+            while distance[at] > here:
+                at -= 1
+            while at < last and distance[at + 1] <= here:
+                at += 1
+            one = value[at]
+            if at < last:
+                slope = (value[at + 1] - one) / (distance[at + 1] - distance[at])
+                one = slope * (here - distance[at]) + one
+            found[row, k] = one * weights[k]
+    return found
 
 
 def _regular(times: Floats) -> bool:

@@ -215,6 +215,21 @@ def test_irregular_and_regular_times_have_the_same_filter():
     )
 
 
+@pytest.mark.parametrize(("cutoff_hz", "attenuation_db"), [(2.0, 40.0), (9.3, 60.0), (2.0, 5.0)])
+def test_weights_are_those_of_the_table_between_its_values(cutoff_hz: float, attenuation_db: float) -> None:
+    distance, value = filters._sinc(cutoff_hz, attenuation_db)
+    random = np.random.default_rng(4)
+    outputs, times = np.array([0.7, 1.0]), np.sort(random.uniform(0.0, 2.0, 500))
+    # On values of the table, at its end, and one rounding beyond.
+    times[:4] = 0.7, 1.0 - distance[7], 0.7 + distance[-1], np.nextafter(0.7 + distance[-1], 9.0)
+    weights = random.uniform(0.0, 1.0, len(times))
+    found = filters._kernel(outputs, times, weights, distance, value)
+    apart = np.abs(outputs[:, None] - times)
+    inside = distance[-1] > 0.0
+    expected = np.interp(apart, distance, value, right=0.0) * weights if inside else np.zeros_like(apart)
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_the_share_of_flagged_samples_is_that_of_their_weight():
     times = np.arange(0.0, 20.0, 0.01)
     parallel = ParallelFilter(times, np.array([5.0, 10.0, 15.0]), 2.0)
