@@ -27,6 +27,7 @@ from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from fri.errors import DataError
@@ -400,8 +401,8 @@ class _Block:
         """Known samples (m, J) for a delay, as 0 and 1."""
         data = self.data
         step = float(data.times[1] - data.times[0])
-        place = np.rint((data.motor_times[self.inside] - delay - data.times[0]) / step).astype(np.int64)
-        found = data.known[np.clip(place, 0, len(data.times) - 1)].astype(np.float64)
+        times = np.ascontiguousarray(data.motor_times[self.inside])
+        found = _known_at(times, delay, float(data.times[0]), step, data.known)
         release(data.known)
         return found
 
@@ -410,14 +411,38 @@ class _Block:
         data = self.data
         times = data.motor_times[self.inside] - delay
         dt = float(data.times[1] - data.times[0])
-        qdd, qd, torque = np.split(
-            interpolate_uniform(self.state, float(data.times[0]), dt, times), 3, axis=1
-        )
+        moved = interpolate_uniform(self.state, float(data.times[0]), dt, times)
         release(self.state)
-        signals = np.empty((*qd.shape, 4))
-        for k, signal in enumerate((qdd, qd, np.sign(qd), data.motor_torque[self.inside] - torque)):
-            np.multiply(signal, known, out=signals[:, :, k])
+        signals = _signals(moved, np.ascontiguousarray(data.motor_torque[self.inside]), known)
         return self.parallel.apply(signals)
+
+
+@njit(cache=True, nogil=True)
+def _known_at(times, delay, start, step, known):  # type: ignore[no-untyped-def]
+    """Known samples (m, J), as 0 and 1, of (n, J) evenly from `start` at times (m,) less a delay [s]."""
+    found = np.zeros((len(times), known.shape[1]))
+    for k in range(len(times)):
+        place = min(max(int(np.rint((times[k] - delay - start) / step)), 0), len(known) - 1)
+        for j in range(known.shape[1]):
+            if known[place, j]:
+                found[k, j] = 1.0
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _signals(moved, motor_torque, known):  # type: ignore[no-untyped-def]
+    """qdd, qd, its sign and the difference of the torques (m, J, 4) over the known samples (m, J), from qdd, qd and
+    joint torque (m, 3 J)."""
+    samples, joints = motor_torque.shape
+    found = np.empty((samples, joints, 4))
+    for k in range(samples):
+        for j in range(joints):
+            speed, share = moved[k, joints + j], known[k, j]
+            found[k, j, 0] = moved[k, j] * share
+            found[k, j, 1] = speed * share
+            found[k, j, 2] = np.sign(speed) * share
+            found[k, j, 3] = (motor_torque[k, j] - moved[k, 2 * joints + j]) * share
+    return found
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import ident.rows.delay as module
 from fri.errors import DataError
 from ident.rows.content import Kept
 from ident.rows.delay import Delay, DelayData, _misfit, _Rows, estimate_delay
-from ident.rows.filters import SignalSettings, differentiate
+from ident.rows.filters import SignalSettings, differentiate, interpolate_uniform
 from ident.rows.prepare import prepare
 from tests.ident import estimation_arm as arm
 
@@ -164,6 +164,24 @@ def test_equal_data_are_estimated_once_and_each_other_argument_anew(monkeypatch:
     estimate_delay([first], joints, search_s=0.05)
     estimate_delay([first], ("A1", "E1"))
     assert len(calls) == 6
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.0137, -0.3])
+def test_samples_of_a_delay_are_those_of_the_moved_channel(delay: float) -> None:
+    found = data(0.02)
+    found = replace(found, known=np.random.default_rng(1).random(found.known.shape) < 0.8)
+    rows = _Rows.of([found], 5.0, 0.1)
+    assert rows is not None
+    (block,) = rows.blocks
+    times = found.motor_times[block.inside] - delay
+    place = np.clip(np.rint((times - found.times[0]) / DT).astype(int), 0, len(found.times) - 1)
+    known = block.known(delay)
+    np.testing.assert_array_equal(known, found.known[place])
+    moved = interpolate_uniform(block.state, float(found.times[0]), DT, times)
+    qdd, qd, torque = np.split(moved, 3, axis=1)
+    signals = np.stack([qdd, qd, np.sign(qd), found.motor_torque[block.inside] - torque], axis=2)
+    expected = block.parallel.apply(signals * known[:, :, None])
+    np.testing.assert_allclose(block.at(delay, known), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_rows_take_every_sample_and_the_coarse_search_forty_a_period():
