@@ -86,9 +86,6 @@ class Evidence:
         )
         self.fold, self.parts = fitted.fold, fitted.parts
         self._block, self._order, self._starts = fitted.block, fitted.order, fitted.starts
-        self._columns = {key: own.columns for key, own in fitted.keys.items()}
-        self._acting = {key: own.acting for key, own in fitted.keys.items()}
-        self._targets = {key: own.target for key, own in fitted.keys.items()}
         self.mask = {key: own.mask for key, own in fitted.keys.items()}
         self._weights: dict[Key, float] = {}
         self._independent: dict[Key, float] = {}
@@ -229,7 +226,7 @@ class Evidence:
                 place += width_of(rows)
         further = partial(self._further, columns, self.extra)
         sums = np.concatenate([known.crossed[id(rows)] for rows in self.extra], axis=2)
-        return Products(known.alone, known.own, known.target, known.parts, further, sums, plain=known)
+        return replace(known, further=further, further_sums=sums, plain=known)
 
     def _further(self, columns: _Columns, groups: Sequence[Rows]) -> Floats:
         """Products (blocks, k, w) of padded columns with groups of further columns."""
@@ -289,9 +286,10 @@ class Evidence:
         places = np.arange(width)
         for key, wide in columns.items():
             starts, weight = self._starts[key[0]], self._weights[key]
-            add_products(wide, self._columns[key], starts, weight, self._acting[key], base)
+            fitted = self.fitted_rows.keys[key]
+            add_products(wide, fitted.columns, starts, weight, fitted.acting, base)
             add_own_products(wide, starts, weight, places, own)
-            add_products(wide, self._targets[key], starts, weight, places[:1], target)
+            add_products(wide, fitted.target, starts, weight, places[:1], target)
         return Products(base, own, target[:, :, 0], self.parts)
 
     def information(self, products: Products) -> float:

@@ -47,11 +47,9 @@ class FittedRows:
         self.sides = dict(nominal.rows)
         self.keys: dict[Key, JointRows] = {}
         for side, rows in self.sides.items():
-            same = before is not None and before.sides[side] is rows
-            for joint in range(nominal.arm.chain.n):
-                key = side, joint
-                known = before.keys[key] if before is not None and same else None
-                self.keys[key] = self._joint_rows(rows, key) if known is None else known
+            kept = before.keys if before is not None and before.sides[side] is rows else {}
+            for key in ((side, joint) for joint in range(nominal.arm.chain.n)):
+                self.keys[key] = kept[key] if kept else self._joint_rows(rows, key)
 
     def _layout(self, nominal: Nominal, settings: DiagnosisSettings) -> None:
         numbers: dict[tuple[int, int], int] = {}

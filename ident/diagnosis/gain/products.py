@@ -71,9 +71,7 @@ class Products:
 
 def width_of(rows: Rows) -> int:
     """Number of columns, 0 without rows."""
-    for columns in rows.values():
-        return int(columns.shape[1])
-    return 0
+    return next(iter(rows.values())).shape[1] if rows else 0
 
 
 def scale_of(squares: Floats) -> Floats:

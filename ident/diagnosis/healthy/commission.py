@@ -155,36 +155,51 @@ def _recorded(
     return recorded
 
 
+class _Fits:
+    """Healthy sets fitted with an arm, and anew only with one that acts differently.
+
+    base : of the results. benches, days : of each set, with the latest arm.
+    """
+
+    def __init__(
+        self, recorded: Sequence[Sequence[SessionRecord]], settings: DiagnosisSettings, base: BaseSet
+    ) -> None:
+        self.recorded, self.settings, self.base = recorded, settings, base
+        self.arm: NominalArm | None = None
+        self.benches: list[DiagnosisBench] = []
+        self.days: list[_Day] = []
+
+    def fit(self, arm: NominalArm) -> list[_Day]:
+        """The results of each set with the arm."""
+        if self.arm is None or not arm.acts_as(self.arm):
+            self.arm, self.benches = arm, []  # the former ones go before the new ones come
+            for recordings in self.recorded:
+                self.benches.append(
+                    prepare_bench(arm, recordings, self.settings, None, (), fit_compliance=False)
+                )
+            self.days = [_day(bench, self.settings, self.base) for bench in self.benches]
+        return self.days
+
+
 def _with_days(
     settled: SettledArm, recorded: Sequence[Sequence[SessionRecord]], settings: DiagnosisSettings
 ) -> tuple[NominalArm, list[_Day]]:
     """The settled arm with its slow friction, open delays and own effects, and the results of each set with it."""
-    of, benches, found = settled.arm, list[DiagnosisBench](), list[_Day]()
-
-    def days(arm: NominalArm) -> list[_Day]:
-        nonlocal of, found
-        if not benches or not arm.acts_as(of):
-            benches.clear()
-            for recordings in recorded:
-                benches.append(prepare_bench(arm, recordings, settings, None, (), fit_compliance=False))
-            of, found = arm, [_day(bench, settings, settled.base) for bench in benches]
-        return found
-
-    first = days(settled.arm)
-    known = with_far_presliding(
-        settled.arm, [day.slow_turns for day in first], [day.coulomb for day in first]
-    )
+    fits = _Fits(recorded, settings, settled.base)
+    days = fits.fit(settled.arm)
+    known = with_far_presliding(settled.arm, [day.slow_turns for day in days], [day.coulomb for day in days])
     for _ in range(_SETTLING):
         # The delay of a channel depends on the reversal of friction, so it is settled last.
+        days = fits.fit(known)
         open_s = {
-            side: float(np.mean([day.late[side][0] for day in days(known)]))
+            side: float(np.mean([day.late[side][0] for day in days]))
             for side in CHANNELS
             if side not in settled.late
         }
         known = later(known, open_s)
-    days(known)
-    known = replace(known, healthy=character(benches, settings))
-    return known, days(known)
+    fits.fit(known)
+    known = replace(known, healthy=character(fits.benches, settings))
+    return known, fits.fit(known)
 
 
 class _Shown(NamedTuple):
