@@ -51,6 +51,8 @@ METHOD = {
 
 _BIN = 20
 _BEGIN = 500
+# Shortest simulated part of one of many sessions.
+_SHORTEST_S = 10.0
 # Cycles from one look for an unstable arm to the next.
 _CHECKED = 100
 _POSES = 100
@@ -98,7 +100,8 @@ class Replay:
     """Replays sessions; call it with a model and sessions.
 
     stiffness : (n,) of the joints [Nm/rad], as of `replay`. sessions : all of the diagnosis, for their numbers.
-    longest_s : longest simulated part of a session, extended for an effect at a later moment. encoder : side of the
+    longest_s : longest simulated part of a session, extended for an effect at a later moment. together_s : of all of
+    them: of many sessions shorter parts are simulated, of very many only some, evenly chosen. encoder : side of the
     elastic joints with the published positions, None: as the model takes them. first : by call, the first replayed
     session and its replay.
     """
@@ -109,15 +112,17 @@ class Replay:
         sessions: Sequence[Session] = (),
         *,
         longest_s: float = 60.0,
+        together_s: float = 180.0,
         encoder: EncoderSide | None = None,
     ) -> None:
         self.stiffness = stiffness
-        self.longest_s = longest_s
+        self.longest_s, self.together_s = longest_s, together_s
         self.encoder = encoder
         self._failed: dict[str, dict[str, None]] = {}
         self._undriven: dict[str, None] = {}
         self._stood_in: dict[str, None] = {}
         self._stiff: dict[str, None] = {}
+        self._shortened = ""
         self._order = sorted(session.start for session in sessions)
         self._inertia: dict[int, Floats] = {}
         self.first: list[tuple[str, Replayed]] = []
@@ -127,14 +132,15 @@ class Replay:
         n = model.structure.chain.n
         squares, count = np.zeros((3, n)), np.zeros((3, n))
         done: Replayed | None = None
-        for session in sessions:
+        chosen, longest_s = self._parts(sessions)
+        for session in chosen:
             name = session.path.name
             number = self._order.index(session.start) if session.start in self._order else None
             try:
                 done = replay(
                     model,
                     session,
-                    self.longest_s,
+                    longest_s,
                     stiffness=self.stiffness,
                     encoder=self.encoder or ("motor" if positions_of_motors(model) else "link"),
                     number=number,
@@ -165,10 +171,27 @@ class Replay:
         ]
         return SimulationError(position=rms[0], motor=rms[1], joint=rms[2], method=METHOD)
 
+    def _parts(self, sessions: Sequence[Session]) -> tuple[list[Session], float]:
+        """The sessions to simulate, and the longest part of each [s]."""
+        longest_s = min(self.longest_s, max(self.together_s / max(len(sessions), 1), _SHORTEST_S))
+        most = max(int(self.together_s / longest_s), 1)
+        chosen = list(sessions)
+        if len(sessions) > most:
+            chosen = [sessions[k] for k in np.linspace(0, len(sessions) - 1, most).round().astype(int)]
+        if longest_s < self.longest_s:
+            number = (
+                f"{len(chosen)} of {len(sessions)} sessions"
+                if len(chosen) < len(sessions)
+                else "each session"
+            )
+            self._shortened = f"replay of at most the first {longest_s:.0f} s of {number}, for time"
+        return chosen, longest_s
+
     @property
     def notes(self) -> tuple[str, ...]:
         """Sessions left out and reasons, and other limits of the replay, a sentence each."""
-        found = [f"no simulation of {', '.join(names)}: {reason}" for reason, names in self._failed.items()]
+        found = [self._shortened] if self._shortened else []
+        found += [f"no simulation of {', '.join(names)}: {reason}" for reason, names in self._failed.items()]
         if self._undriven:
             found.append(
                 f"replay of {', '.join(self._undriven)}: no motor torques in the log or in the model, so there is no "

@@ -186,3 +186,15 @@ def test_a_real_arm_is_replayed_to_the_error_of_its_model() -> None:
     assert error is not None
     assert error.position is None
     assert np.all(of(error, "joint") < 2.5 * joint_rms(found, 3) + 0.1)
+
+
+def test_of_many_sessions_shorter_parts_are_simulated_and_of_very_many_some(
+    models: tuple[DynamicModel, DynamicModel], sessions: Mapping[str, Session]
+) -> None:
+    base, session = models[0], sessions["nominal"]
+    follower = Replay(Arm.load().stiffness, [session], longest_s=12.0, together_s=20.0)
+    assert follower(base, [session]) is not None
+    assert follower.notes == ()
+    assert follower(base, [session] * 5) is not None
+    assert follower.notes == ("replay of at most the first 10 s of 2 of 5 sessions, for time",)
+    assert follower.first[-1][1].duration_s <= 10.0
