@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise, product
@@ -17,7 +17,8 @@ from ident.diagnosis.gain.score import Score, chance
 from ident.diagnosis.rows.nominal import Nominal, SideRows
 from ident.diagnosis.rows.recording import sensor_limits
 from ident.diagnosis.settings import A_COEFFICIENT
-from ident.effects import DELAYS, EFFECTS, Effect, Setting, Shape
+from ident.effects import DELAYS, EFFECTS, Column, Effect, Setting, Shape
+from ident.effects.motion import ArmMotion
 from ident.rows.data_quality import run_bounds
 from lwr_driver.session.spool import Arena
 
@@ -228,6 +229,18 @@ class Dictionary:
         """Columns of a candidate in rows: (m, k) by side and joint."""
         effect, joint = candidate.effect, max(candidate.joint, 0)
         reduced = self.nominal.columns(lambda motion: effect.columns(motion, joint, shape), effect.seen_by)
+        return self._by_joint(candidate, reduced)
+
+    def turned(self, candidate: Candidate, shape: Shape) -> Rows:
+        """The columns as they were if motor and sensor changed places."""
+        effect, joint = candidate.effect, max(candidate.joint, 0)
+
+        def made(motion: ArmMotion) -> list[Column]:
+            return [Column(motor=one.joint, joint=one.motor) for one in effect.columns(motion, joint, shape)]
+
+        return self._by_joint(candidate, self.nominal.columns(made))
+
+    def _by_joint(self, candidate: Candidate, reduced: Mapping[str, Sequence[Floats]]) -> Rows:
         found: dict[Key, Floats] = {}
         for side, columns in reduced.items():
             if not columns:

@@ -16,6 +16,7 @@ from ident.diagnosis.gain.products import Rows
 from ident.diagnosis.healthy.bench import DiagnosisBench
 from ident.diagnosis.healthy.reference import USUAL_DAYS
 from ident.diagnosis.outcome.result import Finding
+from ident.diagnosis.verdict.agreement import in_one_joint, on_both_sides, uneven
 from ident.diagnosis.verdict.confidence import Grounds, probability
 from ident.diagnosis.verdict.findings import finding_of, timing_finding
 from ident.diagnosis.verdict.task import State, Task
@@ -58,7 +59,8 @@ class Confirmed:
 
 
 def confirmed(task: Task, state: State) -> tuple[list[Confirmed], list[Finding]]:
-    """The claims of a selection not refuted by held-out rows, and findings of the others, of confidence zero.
+    """The claims of a selection not refuted by held-out rows or by the other side of their drive, and findings of the
+    others, of confidence zero.
 
     A deviation of the healthy arm, or the error of a stronger cause's law, is significant in the rows fitted but
     predicts nothing.
@@ -67,6 +69,8 @@ def confirmed(task: Task, state: State) -> tuple[list[Confirmed], list[Finding]]
     claims = state.selection.claims
     rows_of = [c.trial.rows for c in claims]
     after = held_out(bench.evidence, [*rows_of, *nuisance])
+    elsewhere = [on_both_sides(bench.dictionary, claim) for claim in claims]
+    at_odds = [uneven(bench.dictionary, c) or in_one_joint(bench.dictionary, c) for c in claims]
     kept, refuted = list[Confirmed](), list[Finding]()
     for k, claim in enumerate(claims):
         without = held_out(bench.evidence, [*(r for i, r in enumerate(rows_of) if i != k), *nuisance])
@@ -74,12 +78,13 @@ def confirmed(task: Task, state: State) -> tuple[list[Confirmed], list[Finding]]
         weights = {(side, j): float(bench.evidence.sigma[side][j]) ** -2 for side, j in claim.trial.rows}
         fallen = fall(without, after, weights, seed)
         hardly = _excitation(claim, bench) < _EXCITED
-        if _refuted(claim, finding, bench, fallen, hardly):
+        if elsewhere[k] or _refuted(claim, finding, bench, fallen, hardly):
             refuted.append(replace(finding, confidence=0.0))
             continue
         untested = _untested(claim) or hardly
         grounds = _grounds(claim, claims, finding, bench, without, after, fallen, untested, seed)
-        most = 1.0 if _plain(claim, finding, bench, grounds, fallen) else OPEN
+        plain = not at_odds[k] and _plain(claim, finding, bench, grounds, fallen)
+        most = 1.0 if plain else OPEN
         kept.append(Confirmed(claim, finding, grounds, most))
     return kept, refuted
 
