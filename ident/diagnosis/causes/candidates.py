@@ -14,8 +14,9 @@ from ident.diagnosis.gain.evidence import Evidence
 from ident.diagnosis.gain.products import Floats, Key, Products, Rows
 from ident.diagnosis.gain.rivals import exceeds
 from ident.diagnosis.gain.score import Score, chance
-from ident.diagnosis.rows.nominal import Nominal, SideRows
+from ident.diagnosis.rows.nominal import Nominal
 from ident.diagnosis.rows.recording import sensor_limits
+from ident.diagnosis.rows.side_rows import SideRows
 from ident.diagnosis.settings import A_COEFFICIENT
 from ident.effects import DELAYS, EFFECTS, Column, Effect, Setting, Shape
 from ident.effects.motion import ArmMotion
@@ -201,7 +202,7 @@ class Dictionary:
         wanted = list(EFFECTS) if causes is None else list(causes)
         motor = "motor" in nominal.rows
         # An earlier low-pass may have shifted a channel, without any fault of the arm.
-        hidden = {DELAYS[side].cause for side, band in nominal.band_hz.items() if band is not None}
+        hidden = {DELAYS[side].cause for side, band in nominal.grid.band_hz.items() if band is not None}
         if nominal.moving.sum() < 2:
             # A late channel is late in all joints; in one joint alone it could be elasticity as well.
             hidden |= {delay.cause for delay in DELAYS.values()}

@@ -21,7 +21,7 @@ from ident.diagnosis.causes.candidates import Dictionary
 from ident.diagnosis.gain.evidence import Evidence
 from ident.diagnosis.gain.products import Floats, Key, Products, Rows
 from ident.diagnosis.gain.score import Score
-from ident.diagnosis.rows.nominal import TRAVEL_RAD
+from ident.diagnosis.rows.recording import TRAVEL_RAD
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import NAMELESS
 from ident.effects.motion import ArmMotion

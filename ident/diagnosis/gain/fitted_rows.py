@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from fri.errors import DataError
 from ident.diagnosis.gain.products import Floats, Key
-from ident.diagnosis.rows.nominal import Nominal, SideRows
+from ident.diagnosis.rows.nominal import Nominal
+from ident.diagnosis.rows.side_rows import SideRows
 from ident.diagnosis.settings import DiagnosisSettings
 from lwr_driver.session.spool import Arena
 

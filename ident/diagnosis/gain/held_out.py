@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:  # the words about a diagnosis need a constant of this module, and no search
     from ident.diagnosis.gain.evidence import Evidence
     from ident.diagnosis.gain.products import Floats, Key, Rows
-    from ident.diagnosis.rows.nominal import SideRows
+    from ident.diagnosis.rows.side_rows import SideRows
 
 _DRAWS = 1000
 FELT_WORSE = 0.01

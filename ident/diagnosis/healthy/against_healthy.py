@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.rows.broken_data import BrokenChannel
-from ident.diagnosis.rows.nominal import SideRows
+from ident.diagnosis.rows.side_rows import SideRows
 from ident.screening.doubts import Doubt
 
 # Least correlation of a torque with that of the healthy arm of which it is a copy, and largest one of another with it.

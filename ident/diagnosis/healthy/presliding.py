@@ -39,10 +39,10 @@ def presliding_length(nominal: Nominal, values: Floats) -> Floats:
     if "motor" not in nominal.rows:
         return lengths
     rows, motions = nominal.rows["motor"], nominal.motions
-    acceleration = nominal.reduce("motor", [m.motor_acceleration for m in motions])
-    speed = nominal.reduce("motor", [m.motor_speed for m in motions])
+    acceleration = nominal.grid.reduce("motor", [m.motor_acceleration for m in motions])
+    speed = nominal.grid.reduce("motor", [m.motor_speed for m in motions])
     predicted = np.einsum("jmp,p->mj", rows.matrix, values)
-    before = nominal.reduce("motor", [m.direction for m in motions])
+    before = nominal.grid.reduce("motor", [m.direction for m in motions])
     for joint in range(n):
         keep = rows.valid[:, joint] & ~rows.test
         coulomb = float(motions[0].motor_coulomb[joint])
@@ -80,7 +80,7 @@ def _misfit(
         else:
             path = np.ascontiguousarray(np.cumsum(v) * m.dt)
             state.append(dahl(path, float(np.exp(logarithm)), float(np.sign(v[0]))))
-    table = np.column_stack([plain, nominal.reduce("motor", state)])[keep]
+    table = np.column_stack([plain, nominal.grid.reduce("motor", state)])[keep]
     rest = target[keep] - table @ np.linalg.lstsq(table, target[keep], rcond=None)[0]
     return float(rest @ rest)
 
@@ -102,7 +102,7 @@ def slow_turns(nominal: Nominal, evidence: Evidence) -> SlowTurns:
                 path = np.ascontiguousarray(np.cumsum(m.motor_speed[:, joint]) * m.dt)
                 state = dahl(path, longer * float(lengths[joint]), float(np.sign(m.motor_speed[0, joint])))
                 signals.append(state - m.direction[:, joint])
-            rows = {("motor", int(joint)): nominal.reduce("motor", signals)[:, None]}
+            rows = {("motor", int(joint)): nominal.grid.reduce("motor", signals)[:, None]}
             score = evidence.score(evidence.padded(rows))
             if np.isfinite(score.gain):
                 found[:, k, joint] = score.coefficients[0], np.sqrt(score.covariance[0, 0])

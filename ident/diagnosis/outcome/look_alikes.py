@@ -276,12 +276,12 @@ def _traces(bench: DiagnosisBench, first: Signature, second: Signature) -> tuple
         # The variables are those of the causes' own joint, whichever joint shows them.
         own = next((j for place in (first, second) for j in place.joints), joint + 1) - 1
         states = [
-            nominal.reduce(side, [getattr(m, name)[:, own] for m in nominal.motions])
+            nominal.grid.reduce(side, [getattr(m, name)[:, own] for m in nominal.motions])
             for name in ("q", "motor_speed", "joint_torque")
         ]
         used = np.isfinite(first.left[side][:, joint])
         ahead = bench.dictionary.setting.motor_ahead(own)
-        motors = nominal.reduce(side, [m.motor_angle(own, ahead) for m in nominal.motions])
+        motors = nominal.grid.reduce(side, [m.motor_angle(own, ahead) for m in nominal.motions])
         turns = motors * nominal.arm.gear_ratio[own] / (2.0 * np.pi)
         columns = (
             first.time[side],

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
-from ident.diagnosis.rows.nominal import SideRows
 from ident.diagnosis.rows.recording import SessionRecord
+from ident.diagnosis.rows.side_rows import SideRows
 from ident.estimators.covariance import correlation_time
 from ident.rows.filters import median_step
 

@@ -25,7 +25,8 @@ from ident.diagnosis.outcome.result import (
     Unexplained,
 )
 from ident.diagnosis.outcome.torque_errors import TorqueErrors, errors_of_both
-from ident.diagnosis.rows.nominal import TRAVEL_RAD, Nominal
+from ident.diagnosis.rows.nominal import Nominal
+from ident.diagnosis.rows.recording import TRAVEL_RAD
 from ident.diagnosis.verdict.confidence import believable
 from ident.diagnosis.verdict.confirmation import FELT_POWER, Confirmed, confirmed, contradicted, doubted
 from ident.diagnosis.verdict.extension import Member, extension, power_left, title, titles
@@ -350,7 +351,7 @@ def _shipped(
 def _states(nominal: Nominal, side: str, block: NDArray[np.int64]) -> RowStates:
     rows, motions = nominal.rows[side], nominal.motions
     signals = ([m.q for m in motions], [m.motor_speed for m in motions], [m.joint_torque for m in motions])
-    return RowStates(rows.time, rows.session, block, *(nominal.reduce(side, parts) for parts in signals))
+    return RowStates(rows.time, rows.session, block, *(nominal.grid.reduce(side, parts) for parts in signals))
 
 
 # ---- notes ----
@@ -490,7 +491,7 @@ def _notes(task: Task, bench: DiagnosisBench, measured: Mapping[str, Floats]) ->
             "from the last link, and the reference was learned without it; add a session without a payload"
             for name in unchecked_masses(nominal.base, nominal.masses, reference)
         ]
-    for side, band in nominal.band_hz.items():
+    for side, band in nominal.grid.band_hz.items():
         if band is not None:
             notes.append(
                 f"the {side} torque was low-passed before recording, with nothing left above {2.0 * band:.2g} Hz: "

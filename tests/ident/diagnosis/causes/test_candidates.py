@@ -94,7 +94,7 @@ def test_columns_by_parts_are_those_of_whole_motions(make: Callable[..., Session
                 for side in nominal.rows:
                     signals = [getattr(column, side) for column in columns]
                     if signals[0] is not None:
-                        expected = nominal.reduce(side, signals)
+                        expected = nominal.grid.reduce(side, signals)
                         scale = np.abs(expected).max()
                         np.testing.assert_allclose(parts[side][k], expected, rtol=1e-9, atol=1e-9 * scale)
 
@@ -113,7 +113,7 @@ def test_hat_functions_in_rows_are_those_of_the_motion(make: Callable[..., Sessi
         )
         times = [hat * load[:, None] for hat, load in zip(whole, loads, strict=True)]
         for mine, expected in ((plain, whole), (loaded, times)):
-            rows = nominal.reduce(side, expected)
+            rows = nominal.grid.reduce(side, expected)
             np.testing.assert_allclose(mine, rows, rtol=1e-9, atol=1e-12 * np.abs(rows).max())
 
 

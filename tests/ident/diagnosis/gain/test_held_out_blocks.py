@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ident.diagnosis.gain.held_out import _blocks_of
-from ident.diagnosis.rows.nominal import SideRows
+from ident.diagnosis.rows.side_rows import SideRows
 
 
 def rows(session: list[int], time: list[float]) -> SideRows:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ident.diagnosis.healthy.against_healthy import against_healthy
-from ident.diagnosis.rows.nominal import SideRows
+from ident.diagnosis.rows.side_rows import SideRows
 from ident.screening.doubts import Doubt
 
 NAMES = ("A1", "A2", "A3")

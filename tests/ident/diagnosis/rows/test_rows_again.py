@@ -11,8 +11,9 @@ import pytest
 from ident.diagnosis.gain.evidence import Evidence
 from ident.diagnosis.gain.fitted_rows import FittedRows
 from ident.diagnosis.outcome.signatures import signature_bench
-from ident.diagnosis.rows.nominal import Floats, Nominal
+from ident.diagnosis.rows.nominal import Nominal
 from ident.dynamics.kinematics import Chain
+from ident.effects.motion import Floats
 from lwr_driver.session import Session
 
 

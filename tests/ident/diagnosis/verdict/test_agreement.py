@@ -27,7 +27,8 @@ def claimed(
 ) -> tuple[Dictionary, Claim]:
     bench = signature_bench([make("a.mcap", 1, change), make("b.mcap", 2, change, 1)], chain)
     trial = bench.dictionary.best(Candidate(EFFECTS[cause], joint))
-    assert trial is not None and trial.score.gain > 100.0
+    assert trial is not None
+    assert trial.score.gain > 100.0
     bench.evidence.replace([*bench.evidence.extra, trial.rows])
     return bench.dictionary, Claim(trial, trial.score)
 
