@@ -39,7 +39,8 @@ from benchmarks.mujoco_arms.simulation import Payload, simulate
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import INERTIAL, Floats, split_name
 from ident.estimation.channel_errors import EXACT_CHANNELS
-from ident.estimation.identify import Identification, IdentificationSettings, identify, known_settings
+from ident.estimation.identification import Identification, IdentificationSettings
+from ident.estimation.identify import identify, known_settings
 from ident.estimators import ESTIMATORS
 from ident.rows.filters import SignalSettings
 from lwr_driver.arm import Arm

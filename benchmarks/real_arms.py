@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 
 from fri.errors import LwrError
 from ident.dynamics.kinematics import Chain
-from ident.estimation.identify import AUTO, Identification, IdentificationSettings, identify
+from ident.estimation.identification import Identification, IdentificationSettings
+from ident.estimation.identify import identify
 from ident.estimation.validate import validate
+from ident.estimators.names import AUTO
 from ident.import_log import LogMapping, import_log
 from ident.import_log.mapping import Signal, TimeBase
 from ident.model.dynamic_model import DynamicModel

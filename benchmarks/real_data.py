@@ -35,7 +35,8 @@ from benchmarks.real_arms import defaults
 from benchmarks.real_cases import iiwa14, tx40, unseen
 from ident.dynamics.kinematics import Chain
 from ident.estimation.channel_errors import EXACT_CHANNELS
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identification import Identification, IdentificationSettings
+from ident.estimation.identify import identify
 from ident.estimation.mounting import Mounting, find_mounting
 from ident.estimators import Estimate
 from ident.estimators.physical import cad_prior

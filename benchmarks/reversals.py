@@ -26,8 +26,10 @@ import numpy as np
 from benchmarks.coverage import kind
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coulomb
-from ident.estimation.identify import AUTO, Identification, IdentificationSettings, identify
+from ident.estimation.identification import Identification, IdentificationSettings
+from ident.estimation.identify import identify
 from ident.estimation.validate import validate
+from ident.estimators.names import AUTO
 from ident.rows.filters import SignalSettings
 from lwr_driver.arm import Arm
 from tests.ident.estimation.emulated_sessions import record_pair

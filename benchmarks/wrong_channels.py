@@ -27,7 +27,9 @@ import numpy as np
 
 from fri.errors import DataError
 from ident.dynamics.kinematics import Chain
-from ident.estimation.identify import AUTO, Identification, IdentificationSettings, identify
+from ident.estimation.identification import Identification, IdentificationSettings
+from ident.estimation.identify import identify
+from ident.estimators.names import AUTO
 from ident.screening.screen import screen
 from lwr_driver.configuration import find
 from lwr_driver.session import JointColumns, Session

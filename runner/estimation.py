@@ -14,8 +14,10 @@ from fri.errors import ConfigurationError
 from fri.quantities import Name, within
 from ident.dynamics.structure import Coulomb, Coupling
 from ident.estimation.essential import EssentialSettings
-from ident.estimation.identify import AUTO, IdentificationSettings, estimator_factory
+from ident.estimation.identification import IdentificationSettings
+from ident.estimation.identify import estimator_factory
 from ident.estimators import ESTIMATORS, CovarianceSettings
+from ident.estimators.names import AUTO
 from ident.model import DynamicModel
 from ident.rows.filters import SignalSettings
 from lwr_driver.configuration import find, parse, read_mapping

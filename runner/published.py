@@ -18,7 +18,7 @@ from ident.dynamics.kinematics import Chain
 from lwr_driver.configuration import CONFIGS, find
 
 if TYPE_CHECKING:
-    from ident.estimation.identify import Identification
+    from ident.estimation.identification import Identification
     from ident.excitation import Assembled, ExcitationPlan
 
 SOURCE = (

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from ident.estimation.channel_errors import of_exact_channels
-from ident.estimation.identify import Identification
+from ident.estimation.identification import Identification
 from ident.excitation import ExcitationPlan
 from ident.excitation.arm_model import split_name
 from ident.excitation.planner import Progress as SearchProgress

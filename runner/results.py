@@ -17,7 +17,8 @@ from fri.errors import LwrError, naming
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import DRIVE, split_name
 from ident.estimation.estimator_comparison import compared
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identification import Identification, IdentificationSettings
+from ident.estimation.identify import identify
 from ident.estimation.scores import by_side
 from ident.estimation.validate import validate
 from ident.estimators.estimate import Estimate, two_digits

@@ -10,14 +10,8 @@ if TYPE_CHECKING:
     from ident.estimation.compare import Comparison, compare, competitor_scores
     from ident.estimation.essential import EssentialSettings
     from ident.estimation.forward_simulation import simulate_session
-    from ident.estimation.identify import (
-        ESTIMATORS,
-        EstimatorFactory,
-        Identification,
-        IdentificationSettings,
-        identify,
-        known_settings,
-    )
+    from ident.estimation.identification import EstimatorFactory, Identification, IdentificationSettings
+    from ident.estimation.identify import ESTIMATORS, identify, known_settings
     from ident.estimation.mounting import Mounting, find_mounting
     from ident.estimation.payload import PayloadEstimate, identify_payload, with_payload
     from ident.estimation.scores import Score, SessionScore, score_session, torque_error

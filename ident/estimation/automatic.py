@@ -18,15 +18,8 @@ from ident.dynamics.parameters import Floats
 from ident.effects import SENSOR_GAIN, entry_of
 from ident.estimation.choice import Choice
 from ident.estimation.estimator_comparison import LOOSEST, PLAIN, compared
-from ident.estimation.identify import (
-    EstimatorFactory,
-    Identification,
-    IdentificationSettings,
-    Known,
-    estimator_factory,
-    identify,
-    observed,
-)
+from ident.estimation.identification import EstimatorFactory, Identification, IdentificationSettings, Known
+from ident.estimation.identify import estimator_factory, identify, observed
 from ident.estimation.mounting import find_mounting
 from ident.estimation.turning import friction_turning
 from ident.estimators.covariance import CovarianceSettings

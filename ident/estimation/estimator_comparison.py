@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from fri.errors import DataError
 from ident.dynamics.parameters import Floats
 from ident.estimation.choice import Candidate, Choice
-from ident.estimation.identify import Identification
+from ident.estimation.identification import Identification
 from ident.estimation.mounting import tilt_columns
 from ident.estimation.parts import beside, held_back_parts
 from ident.estimators.covariance import CovarianceSettings, effective_rows

@@ -26,13 +26,8 @@ from ident.dynamics.parameters import INERTIAL, Floats
 from ident.dynamics.regressor import torque
 from ident.dynamics.structure import ModelStructure, Side
 from ident.effects.link import sideways_gravity
-from ident.estimation.identify import (
-    Identification,
-    IdentificationSettings,
-    Known,
-    estimator_factory,
-    identify,
-)
+from ident.estimation.identification import Identification, IdentificationSettings, Known
+from ident.estimation.identify import estimator_factory, identify
 from ident.estimators.covariance import CovarianceSettings
 from ident.estimators.estimate import Covariance, fisher_tail
 from ident.estimators.physical import cad_prior, lacking_bodies

@@ -18,7 +18,8 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.parameters import Floats
 from ident.dynamics.structure import Side
 from ident.dynamics.tables import Tabular
-from ident.estimation.identify import IdentificationSettings, Known, identify
+from ident.estimation.identification import IdentificationSettings, Known
+from ident.estimation.identify import identify
 from ident.estimation.scores import Predictor, SessionScore, score_session
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import Model, as_model

@@ -19,7 +19,7 @@ from runner.terminal import NAMED_FILE, PATH, GroupedCommand, hold_json, json_op
 
 if TYPE_CHECKING:
     from ident.dynamics.kinematics import Chain
-    from ident.estimation.identify import Identification, IdentificationSettings
+    from ident.estimation.identification import Identification, IdentificationSettings
     from ident.estimation.mounting import Mounting
     from ident.rows.content import Recall
     from lwr_driver.session import Session

@@ -63,7 +63,7 @@ def validate_command(
     """
     from ident.estimation.compare import competitor_scores
     from ident.estimation.forward_simulation import simulate_session
-    from ident.estimation.identify import IdentificationSettings
+    from ident.estimation.identification import IdentificationSettings
     from ident.estimation.validate import cross_validate, signals_for, validate
     from ident.import_log import read_recording
     from ident.model.model_file import read_model

@@ -22,7 +22,8 @@ from ident.diagnosis import Reference, commission, diagnose
 from ident.dynamics.known_arm import known_arm
 from ident.dynamics.session_chain import session_chain
 from ident.estimation.channel_errors import of_exact_channels
-from ident.estimation.identify import Identification, IdentificationSettings, identify, known_settings
+from ident.estimation.identification import Identification, IdentificationSettings
+from ident.estimation.identify import identify, known_settings
 from ident.estimators.least_squares import factor_of
 from ident.model.model_file import read_model, write_model
 from ident.model.signals import signal_settings

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Side
-from ident.estimation.identify import IdentificationSettings, identify
+from ident.estimation.identification import IdentificationSettings
+from ident.estimation.identify import identify
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import prepare

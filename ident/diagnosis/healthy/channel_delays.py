@@ -12,7 +12,8 @@ from fri.errors import DataError
 from ident.diagnosis.healthy.reference import DELAY_STD_S, USUAL_DAYS, Reference
 from ident.diagnosis.rows.nominal_arm import NominalArm
 from ident.diagnosis.settings import DiagnosisSettings
-from ident.estimation.identify import IdentificationSettings, Known, observed
+from ident.estimation.identification import IdentificationSettings, Known
+from ident.estimation.identify import observed
 from ident.estimators.estimate import chi_square_tail, fisher_tail
 from ident.rows.delay import Delay, weighted_mean
 from lwr_driver.session import Session

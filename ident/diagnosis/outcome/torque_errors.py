@@ -9,7 +9,7 @@ import numpy as np
 
 from ident.diagnosis.gain.held_out import FELT_WORSE
 from ident.diagnosis.gain.products import Floats
-from ident.estimation.identify import Known
+from ident.estimation.identification import Known
 from ident.estimation.scores import SessionScore
 from ident.estimation.validate import validate
 from ident.model import DynamicModel

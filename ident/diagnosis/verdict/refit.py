@@ -25,7 +25,8 @@ from ident.effects import BASE_TILT, SENSOR_GAIN, Column, effects_torque
 from ident.effects.motion import ArmMotion
 from ident.estimation.automatic import choose
 from ident.estimation.choice import Choice
-from ident.estimation.identify import AUTO, Identification, IdentificationSettings, Known
+from ident.estimation.identification import Identification, IdentificationSettings, Known
+from ident.estimators.names import AUTO
 from ident.model import DynamicModel
 from ident.rows.prepare import clock_ns
 from lwr_driver.session import JointColumns, Session

@@ -11,7 +11,8 @@ from fri.errors import ConfigurationError
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import torque
 from ident.estimation.automatic import choose
-from ident.estimation.identify import IdentificationSettings, Known, identify
+from ident.estimation.identification import IdentificationSettings, Known
+from ident.estimation.identify import identify
 from ident.estimation.mounting import find_mounting, tilt_columns
 from ident.estimators import nearest_consistent
 from ident.rows.filters import SignalSettings

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from ident.estimation.channel_errors import EXACT_CHANNELS, beside_channel_errors
-from ident.estimation.identify import Identification, IdentificationSettings, Known, identify
+from ident.estimation.identification import Identification, IdentificationSettings, Known
+from ident.estimation.identify import identify
 from ident.estimators import CovarianceSettings
 from lwr_driver.session import Session
 from tests.ident.estimation_arm import Sensors, chain, session, true_base

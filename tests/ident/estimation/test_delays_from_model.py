@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from fri.errors import DataError
-from ident.estimation.identify import Identification, IdentificationSettings, Known, identify
+from ident.estimation.identification import Identification, IdentificationSettings, Known
+from ident.estimation.identify import identify
 from ident.estimation.validate import validate
 from ident.estimators.problem import Problem
 from ident.rows.delay import Delay, delays_from_model, shared_delay

@@ -10,7 +10,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identification import Identification, IdentificationSettings
+from ident.estimation.identify import identify
 from runner.published import TABLE_2
 from tests.ident.estimation.emulated_sessions import record_pair
 from tests.ident.estimation_arm import chain, true_base

@@ -13,7 +13,8 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.kinematics import Chain
 from ident.estimation.automatic import BesideGains, choose
 from ident.estimation.estimator_comparison import EstimatorComparison, Kind
-from ident.estimation.identify import Identification, IdentificationSettings, Known, identify
+from ident.estimation.identification import Identification, IdentificationSettings, Known
+from ident.estimation.identify import identify
 from ident.estimation.parts import PARTS, beside, held_back_parts
 from ident.estimators import MaximumAPosteriori, Prior, Problem, RowGroup, WeightedLeastSquares
 from ident.estimators.physical import lacking_bodies

@@ -11,7 +11,8 @@ import pytest
 
 from fri.errors import ConfigurationError, DataError
 from ident.estimation.essential import EssentialSettings
-from ident.estimation.identify import Identification, IdentificationSettings, Known, identify
+from ident.estimation.identification import Identification, IdentificationSettings, Known
+from ident.estimation.identify import identify
 from ident.estimators import CovarianceSettings
 from ident.rows import SignalSettings
 from tests.ident import estimation_arm as arm

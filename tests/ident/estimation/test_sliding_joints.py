@@ -8,7 +8,8 @@ import numpy as np
 
 from ident.dynamics.kinematics import Chain
 from ident.estimation.forward_simulation import simulate_session
-from ident.estimation.identify import IdentificationSettings, identify
+from ident.estimation.identification import IdentificationSettings
+from ident.estimation.identify import identify
 from ident.estimation.validate import validate
 from ident.screening.channels import check_channels
 from lwr_driver.listing import text_of

@@ -15,9 +15,11 @@ from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import Coulomb
 from ident.effects.motion import dahl, turned_friction
 from ident.estimation import turning
-from ident.estimation.identify import AUTO, IdentificationSettings, Known, identify
+from ident.estimation.identification import IdentificationSettings, Known
+from ident.estimation.identify import identify
 from ident.estimation.turning import friction_turning
 from ident.estimation.validate import validate
+from ident.estimators.names import AUTO
 from ident.rows.prepared import TorqueChannel
 from lwr_driver.configuration import find
 from tests.ident.estimation.emulated_sessions import record_pair

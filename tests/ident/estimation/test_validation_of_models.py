@@ -13,7 +13,8 @@ from fri.errors import ConfigurationError, DataError
 from ident.dynamics.base_set import numeric_base
 from ident.estimation.compare import competitor_scores
 from ident.estimation.forward_simulation import simulate, simulate_session
-from ident.estimation.identify import IdentificationSettings, identify
+from ident.estimation.identification import IdentificationSettings
+from ident.estimation.identify import identify
 from ident.estimation.validate import Validation, cross_validate, validate
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import SignalSettings

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from ident.dynamics.kinematics import Chain
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identification import Identification, IdentificationSettings
+from ident.estimation.identify import identify
 from ident.estimation.mounting import Mounting, find_mounting
 from ident.import_log import LogMapping, import_log
 from lwr_driver.configuration import CONFIGS, find

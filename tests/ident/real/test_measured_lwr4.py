@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from ident.estimation.channel_errors import EXACT_CHANNELS
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identification import Identification, IdentificationSettings
+from ident.estimation.identify import identify
 from ident.rows.filters import differentiate, low_pass
 from ident.rows.timebase import stretches
 from lwr_driver.session import JointColumns, Session

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.regressor import gravity_torque
 from ident.dynamics.structure import Coulomb, Coupling
-from ident.estimation.identify import Identification, IdentificationSettings, identify
+from ident.estimation.identification import Identification, IdentificationSettings
+from ident.estimation.identify import identify
 from ident.estimation.validate import validate
 from ident.import_log import LogMapping, import_log
 from ident.rows.filters import SignalSettings

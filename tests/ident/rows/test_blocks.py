@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from ident.dynamics.structure import ModelStructure
-from ident.estimation.identify import IdentificationSettings, identify
+from ident.estimation.identification import IdentificationSettings
+from ident.estimation.identify import identify
 from ident.estimation.scores import score_session
 from ident.estimation.validate import predictor
 from ident.rows import SignalSettings, commanded, observe, prepare

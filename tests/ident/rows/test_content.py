@@ -13,7 +13,8 @@ import pytest
 
 from ident.dynamics.kinematics import Chain
 from ident.dynamics.structure import ModelStructure
-from ident.estimation.identify import IdentificationSettings, identify
+from ident.estimation.identification import IdentificationSettings
+from ident.estimation.identify import identify
 from ident.rows import signal_choice
 from ident.rows.content import Kept, Recall, content
 from ident.rows.filtered_motion import WideMotion

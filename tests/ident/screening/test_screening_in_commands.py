@@ -12,7 +12,8 @@ import pytest
 from benchmarks.wrong_channels import constant, from_the_middle, scaled, shifted, swapped
 from fri.errors import DataError
 from ident.estimation import Identification, IdentificationSettings, cross_validate, identify, validate
-from ident.estimation.identify import AUTO, Known
+from ident.estimation.identification import Known
+from ident.estimators.names import AUTO
 from ident.rows.filters import SignalSettings
 from ident.screening.doubts import Doubt
 from ident.screening.screen import screen

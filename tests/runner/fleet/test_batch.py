@@ -15,7 +15,8 @@ from playwright.sync_api import Browser
 
 from ident.diagnosis import Reference
 from ident.estimation.channel_errors import EXACT_CHANNELS
-from ident.estimation.identify import IdentificationSettings, identify
+from ident.estimation.identification import IdentificationSettings
+from ident.estimation.identify import identify
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import read_model
 from lwr_driver.session import SessionWriter, session_metadata
