@@ -114,6 +114,10 @@ class Drifting(Effect):
         """Between sessions, or in one of them alone."""
         return super().passing(shape) or shape.form in (*self.onsets, *self.singly)
 
+    def lasts(self, form: Form | None, motion: ArmMotion) -> bool:
+        """Unless it is undone."""
+        return form is not Course.STEP_UNDONE
+
     def course(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Floats, ...]:
         """Factor (N,) of each coefficient."""
         constant = shape.get("time_constant", 0.0)
@@ -134,7 +138,7 @@ class Drifting(Effect):
             later = motion.session + 1 - round(shape["session"])
             if later == 0:
                 return (np.where(motion.time >= shape["time"], 1.0, 0.0),)
-            return (float(later > 0 and shape.form is Course.STEP_WITHIN) * whole,)
+            return (float(later > 0 and self.lasts(shape.form, motion)) * whole,)
         step = float(motion.session + 1 >= round(shape.get("since", 2.0))) * whole
         return (step, whole) if shape.form is Course.LEVEL_AND_STEP else (step,)
 

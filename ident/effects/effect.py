@@ -368,6 +368,10 @@ class Effect(ABC):
         """Whether the time of a shape is the best one of a search."""
         return self.event or shape.form in self.onsets
 
+    def lasts(self, form: Form | None, motion: ArmMotion) -> bool:
+        """Whether one of the `onsets` still acts in a motion of a later session."""
+        return True
+
     def passing(self, shape: Shape) -> bool:
         """Whether it is a change between these sessions, or at a moment of one, with no value in a further one."""
         return self.mode(shape) == "between"

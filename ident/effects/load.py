@@ -182,10 +182,14 @@ class PayloadChange(_Payload):
         near = np.linalg.norm(coefficients[:3]) <= _ARM_M * abs(mass) + _SLIP_KG_M
         return super().plausible(coefficients, shape) and bool(near)
 
+    def lasts(self, form: Form | None, motion: ArmMotion) -> bool:
+        """With a payload."""
+        return motion.loaded
+
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """Torque of unit first moments and a unit mass in the last link after the time, in all loaded rows."""
         changed = round(shape["session"]) - 1
-        after = np.full(len(motion.time), motion.loaded and motion.session > changed)
+        after = np.full(len(motion.time), motion.session > changed and self.lasts(shape.form, motion))
         if motion.session == changed:
             after = motion.time >= shape["time"]
         torques = [_body_torque(motion, place) for place in _MOMENTS]

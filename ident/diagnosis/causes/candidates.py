@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise, product
@@ -18,7 +18,7 @@ from ident.diagnosis.rows.nominal import Nominal
 from ident.diagnosis.rows.recording import sensor_limits
 from ident.diagnosis.rows.side_rows import SideRows
 from ident.diagnosis.settings import A_COEFFICIENT
-from ident.effects import DELAYS, EFFECTS, Column, Effect, Setting, Shape
+from ident.effects import DELAYS, EFFECTS, Column, Effect, Form, Setting, Shape
 from ident.effects.motion import ArmMotion
 from ident.rows.data_quality import run_bounds
 from lwr_driver.session.spool import Arena
@@ -214,7 +214,7 @@ class Dictionary:
             for joint in ([-1] if EFFECTS[cause].whole_arm else np.flatnonzero(nominal.moving).tolist())
         )
         self._kept: dict[tuple[str, int], list[_Entry]] = {}
-        self._whole: dict[tuple[str, int, int], _Entry | None] = {}
+        self._whole: dict[tuple[str, int, str], _Entry | None] = {}
         self._pushes: dict[tuple[str, int, str], _Entry | None] = {}
         self._information: dict[tuple[str, int], dict[str, float]] = {}
         self._arena = Arena()
@@ -228,8 +228,12 @@ class Dictionary:
 
     def rows(self, candidate: Candidate, shape: Shape) -> Rows:
         """Columns of a candidate in rows: (m, k) by side and joint."""
+        return self._rows(candidate, lambda _: shape)
+
+    def _rows(self, candidate: Candidate, shape: Callable[[ArmMotion], Shape]) -> Rows:
+        """The same with a shape for each motion."""
         effect, joint = candidate.effect, max(candidate.joint, 0)
-        reduced = self.nominal.columns(lambda motion: effect.columns(motion, joint, shape), effect.seen_by)
+        reduced = self.nominal.columns(lambda m: effect.columns(m, joint, shape(m)), effect.seen_by)
         return self._by_joint(candidate, reduced)
 
     def turned(self, candidate: Candidate, shape: Shape) -> Rows:
@@ -275,40 +279,42 @@ class Dictionary:
             self._pushes[key] = self._entry(shape, rows) if _acts(rows) else None
         return self._pushes[key]
 
+    def _setting_in(self, candidate: Candidate, form: Form) -> _Entry | None:
+        """Of a form that sets in at a time, as if that were before each session, None without rows."""
+        key = (*candidate.key, str(form.value))
+        if key not in self._whole:
+            before = Shape(form, time=-np.inf, session=1)
+            rows = self._rows(candidate, lambda motion: before.at(session=motion.session + 1))
+            self._whole[key] = self._entry(before, rows) if _acts(rows) else None
+        return self._whole[key]
+
     def _onset(self, candidate: Candidate) -> Trial | None:
         """The best edge of a block for the forms that set in at a time. Products after an edge are a part of their
-        blocks, so those of the whole session are made once."""
-        evidence = self.evidence
+        blocks, so those of all sessions are made once."""
+        evidence, effect = self.evidence, candidate.effect
         best: tuple[Shape, Score, Rows] | None = None
-        sessions = sorted(set(evidence.block_session.tolist()))
-        for number, (form, session) in enumerate(product(candidate.effect.onsets, sessions)):
-            mine = np.flatnonzero(evidence.block_session == session)
-            starts = evidence.block_start[mine]
-            edges = np.sort(starts)[1:]
-            edges = edges[
-                (edges >= _STEP_ROOM_S) & (edges <= self.setting.durations_s[session] - _STEP_ROOM_S)
-            ]
-            if not len(edges):
-                continue
-            shape = Shape(form, time=starts.min() - 1.0, session=session + 1)
-            key = (*candidate.key, number)
-            if key not in self._whole:
-                made = self.rows(candidate, shape)
-                self._whole[key] = self._entry(shape, made) if _acts(made) else None
-            entry = self._whole[key]
+        for form in effect.onsets:
+            entry = self._setting_in(candidate, form)
             if entry is None:
                 continue
             _, rows, known = entry
             whole = evidence.products(partial(evidence.padded, rows), known)
-            on = np.ones((len(edges), evidence.blocks))
-            on[:, mine] = starts >= edges[:, None]
-            top = int(np.argmax(evidence.fitted(whole, on)))
-            (score,) = evidence.score_products([whole.only(on[top])], [list(rows)])
-            at = shape.at(time=edges[top])
-            score = self._timed(candidate, at, score, evidence.blocks)
-            if best is None or score.gain > best[1].gain:
-                best = (at, score, rows)
-        if best is None or not candidate.effect.plausible(best[1].coefficients, best[0]):
+            lasting = np.unique([m.session for m in self.nominal.motions if effect.lasts(form, m)])
+            fall = evidence.setting_in(whole, lasting)
+            for session in np.unique(evidence.block_session).tolist():
+                mine = np.flatnonzero(evidence.block_session == session)
+                start, last = evidence.block_start[mine], self.setting.durations_s[session] - _STEP_ROOM_S
+                inside = (start > start.min()) & (start >= _STEP_ROOM_S) & (start <= last)
+                if not inside.any():
+                    continue
+                edge = mine[inside][np.argmax(fall[mine[inside]])]
+                after = whole.only(evidence.after(edge, lasting))
+                (score,) = evidence.score_products([after], [list(rows)])
+                at = Shape(form, time=evidence.block_start[edge], session=session + 1)
+                score = self._timed(candidate, at, score, evidence.blocks)
+                if best is None or score.gain > best[1].gain:
+                    best = (at, score, rows)
+        if best is None or not effect.plausible(best[1].coefficients, best[0]):
             return None
         # The rows themselves are made only for a step with enough gain.
         shape, score, rows = best

@@ -396,11 +396,29 @@ class Evidence:
 
         return robust
 
-    def fitted(self, products: Products, on: Floats) -> Floats:
-        """Fall (m,) of the chi-square on the fitted rows by columns in m choices of the blocks, `on` (m, blocks)."""
-        base, own, target = block_sums(on, products.base), block_sums(on, products.own), on @ products.target
-        _, inner, moment, _ = schur((base, own, target), self.full, 0.0)
+    def setting_in(self, products: Products, lasting: NDArray[np.int64]) -> Floats:
+        """Fall (blocks,) of the chi-square on the fitted rows by columns that set in at the start of each block, and
+        act until the end of its session and in those of the later sessions where they are `lasting`."""
+        each = products.base, products.own, products.target
+        sums = np.empty_like(each[0]), np.empty_like(each[1]), np.empty_like(each[2])
+        later = [np.zeros(values.shape[1:]) for values in each]
+        for session in np.unique(self.block_session)[::-1]:
+            mine = np.flatnonzero(self.block_session == session)
+            mine = mine[np.argsort(-self.block_start[mine])]
+            for k, values in enumerate(each):
+                sums[k][mine] = np.cumsum(values[mine], axis=0)
+                whole = sums[k][mine[-1]].copy()
+                sums[k][mine] += later[k]
+                later[k] += whole * (session in lasting)
+        _, inner, moment, _ = schur(sums, self.full, 0.0)
         return np.asarray(np.einsum("mk,mkl,ml->m", moment, inner, moment))
+
+    def after(self, block: int, lasting: NDArray[np.int64]) -> Floats:
+        """1 in the blocks (blocks,) of columns that set in at the start of one, see `setting_in`; 0 in the others."""
+        session = self.block_session[block]
+        on = (self.block_session == session) & (self.block_start >= self.block_start[block])
+        on |= (self.block_session > session) & np.isin(self.block_session, lasting)
+        return on.astype(float)
 
     def event_score(self, score: Score, choices: int) -> Score:
         """Score of columns active in a few blocks, the best of `choices`: the fall on the fitted rows less its

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +16,7 @@ from ident.diagnosis.gain.evidence import Evidence
 from ident.diagnosis.outcome.signatures import signature_bench
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.dynamics.kinematics import Chain
-from ident.effects import EFFECTS
+from ident.effects import EFFECTS, Shape
 from ident.effects.nameless import hats
 from lwr_driver.session import Session
 
@@ -139,6 +140,39 @@ def test_any_number_of_threads_gives_the_same_trials(make: Callable[..., Session
     assert len(found[0]) > 30
     assert found[1] == found[0]
     assert found[2] == found[0]
+
+
+@pytest.mark.parametrize("sessions", [2, 3])
+@pytest.mark.parametrize("cause", ["sensor_offset_drift", "payload_change"])
+def test_steps_of_all_sessions_are_searched_with_the_products_of_one_set_of_columns_for_each_form(
+    make: Callable[..., Session], chain: Chain, cause: str, sessions: int
+) -> None:
+    bench = signature_bench([make(f"{k}.mcap", k, None, k) for k in range(sessions)], chain)
+    motions = [replace(motion, loaded=motion.session != 1) for motion in bench.nominal.motions]
+    nominal, settings = replace(bench.nominal, motions=motions), bench.nominal.settings
+    evidence = Evidence(nominal, settings, bench.evidence.sigma, bench.evidence.variance_inflation)
+    dictionary, effect = Dictionary(nominal, evidence), EFFECTS[cause]
+    candidate = Candidate(effect, -1 if effect.whole_arm else 1)
+    evidence.replace([dictionary.rows(Candidate(EFFECTS["viscous_nonlinear"], 0), Shape(exponent=2.0))])
+    best: dict[tuple[object, int], tuple[float, float]] = {}
+    for form, session in product(effect.onsets, range(sessions)):
+        rows = dictionary.rows(candidate, Shape(form, time=-1.0, session=session + 1))
+        for start in np.sort(evidence.block_start[evidence.block_session == session])[1:]:
+            on = (evidence.block_session != session) | (evidence.block_start >= start)
+            after = evidence.products(evidence.padded(rows)).only(on.astype(float))
+            (score,) = evidence.score_products([after], [list(rows)])
+            if 1.0 <= start <= dictionary.setting.durations_s[session] - 1.0:
+                here = best.get((form, session + 1), (0.0, 0.0))
+                best[form, session + 1] = max(here, (score.fitted, start))
+    made: list[int] = []
+    entry = dictionary._entry
+    dictionary._entry = lambda *of: made.append(1) or entry(*of)  # type: ignore[method-assign,func-returns-value]
+    found = dictionary._onset(candidate)
+    assert found is not None
+    assert len(made) == len(effect.onsets)
+    fitted, time = best[found.shape.form, int(found.shape["session"])]
+    assert found.score.fitted == pytest.approx(fitted, rel=1e-9)
+    assert found.shape["time"] == time
 
 
 def test_no_threads_are_refused() -> None:
