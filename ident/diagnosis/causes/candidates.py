@@ -260,7 +260,7 @@ class Dictionary:
         return found
 
     def _entry(self, shape: Shape, rows: Rows) -> _Entry:
-        products = self.evidence.alone(self.evidence.padded(rows))
+        products = self.evidence.alone(self.evidence.ordered(rows))
         # All candidates together exceed the memory.
         kept = {key: self._arena.keep(values) for key, values in rows.items()}
         return shape, kept, replace(products, alone=self._arena.keep(products.alone))
@@ -298,9 +298,10 @@ class Dictionary:
             if entry is None:
                 continue
             _, rows, known = entry
-            whole = evidence.products(partial(evidence.padded, rows), known)
+            whole = evidence.products(partial(evidence.ordered, rows), known)
+            base = evidence.in_blocks(whole)
             lasting = np.unique([m.session for m in self.nominal.motions if effect.lasts(form, m)])
-            fall = evidence.setting_in(whole, lasting)
+            fall = evidence.setting_in(whole, base, lasting)
             for session in np.unique(evidence.block_session).tolist():
                 mine = np.flatnonzero(evidence.block_session == session)
                 start, last = evidence.block_start[mine], self.setting.durations_s[session] - _STEP_ROOM_S
@@ -308,7 +309,7 @@ class Dictionary:
                 if not inside.any():
                     continue
                 edge = mine[inside][np.argmax(fall[mine[inside]])]
-                after = whole.only(evidence.after(edge, lasting))
+                after = whole.only(evidence.after(edge, lasting), base)
                 (score,) = evidence.score_products([after], [list(rows)])
                 at = Shape(form, time=evidence.block_start[edge], session=session + 1)
                 score = self._timed(candidate, at, score, evidence.blocks)
@@ -355,7 +356,7 @@ class Dictionary:
             both = {} if entry is None else {**entry[1]}
             for key, columns in trial.rows.items():
                 both[key] = columns + both[key] if key in both else columns
-            if self.evidence.score(self.evidence.padded(both)).fitted > trial.score.fitted + _TIED:
+            if self.evidence.score(self.evidence.ordered(both)).fitted > trial.score.fitted + _TIED:
                 return True
         return False
 
@@ -436,7 +437,7 @@ class Dictionary:
     def measure(self, candidate: Candidate, rows: Rows, known: Products | None = None) -> Score:
         """Score of rows by the rules of the candidate's effect; `known` : their products with the base alone."""
         if known is None:
-            return self.evidence.score(self.evidence.padded(rows), pull=_pull(candidate))
+            return self.evidence.score(self.evidence.ordered(rows), pull=_pull(candidate))
         return self.evidence.score_groups([(rows, known)], pull=_pull(candidate))[0]
 
     def _measured(self, candidate: Candidate) -> Iterator[tuple[Shape, Rows, Score]]:

@@ -101,8 +101,7 @@ class Contest:
     def simplest(self) -> list[Trial]:
         """Best shapes of all candidates, without those replaceable by a special case; beside the same columns they
         are the same."""
-        # The evidence keeps the columns, so their identity stays theirs.
-        beside = tuple(map(id, self.evidence.extra))
+        beside = self.evidence.beside_what
         found = self._latest.pop(beside, None) or self._simplest()
         self._latest[beside] = found
         if len(self._latest) > _LATEST:

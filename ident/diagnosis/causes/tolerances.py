@@ -187,7 +187,7 @@ def _sizes(dictionary: Dictionary, evidence: Evidence, least_gain: float) -> lis
         if not rows:
             continue
         size = HABITUAL * _FURTHER * _usual_share(entry, effect)
-        if evidence.information(evidence.alone(evidence.padded(rows))) * size**2 > least_gain:
+        if evidence.information(evidence.alone(evidence.ordered(rows))) * size**2 > least_gain:
             found.append(Tolerance(Kind.SIZE, number, rows, size, candidate.key))
     return found
 

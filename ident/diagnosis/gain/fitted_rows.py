@@ -20,14 +20,14 @@ from lwr_driver.session.spool import Arena
 class JointRows:
     """Rows of one joint and side in the order of the blocks, zero where they are not used.
 
-    columns : (r, k) of the base, the `acting` (k,) ones. target, mask : (r, 1). count : of the used rows. gram, moment,
-    energy : products (blocks, k, k), (blocks, k) and (blocks,) of columns and target in each block.
+    columns : (r, k) of the base, the `acting` (k,) ones. target : (r, 1). mask : (r,) the used rows, `count` of them.
+    gram, moment, energy : products (blocks, k, k), (blocks, k) and (blocks,) of columns and target in each block.
     """
 
     columns: Floats
     acting: NDArray[np.int64]
     target: Floats
-    mask: Floats
+    mask: NDArray[np.bool_]
     count: float
     gram: Floats
     moment: Floats
@@ -110,5 +110,5 @@ class FittedRows:
         for block, (first, last) in enumerate(pairwise(self.starts[side].tolist())):
             own, torque = columns[first:last], target[first:last, 0]
             gram[block], moment[block], energy[block] = own.T @ own, own.T @ torque, torque @ torque
-        mask, count = keep[order, None].astype(float), float(keep.sum())
+        mask, count = np.ascontiguousarray(keep[order]), float(keep.sum())
         return JointRows(columns, acting, target, mask, count, self._arena.keep(gram), moment, energy)

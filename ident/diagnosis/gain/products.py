@@ -36,37 +36,57 @@ class Products:
     """Products of a group's columns with the base, among themselves and with the torques in each block.
 
     alone : (blocks, k, p) with the base parameters; own (blocks, k, k); target (blocks, k). parts : (parts, blocks),
-    1 for the blocks of a part held back in turn. further : makes those with the further columns (blocks, k, w) on
-    demand; further_sums : their sums (parts, k, w). crossed : such sums by group of further columns, as met so far.
-    plain : the same without further columns, which remembers its own sums.
+    1 for the blocks of a part held back in turn. crossed : sums (parts, k, w) of those with groups of further columns,
+    by the number of the group, as met so far.
     """
 
     alone: Floats
     own: Floats
     target: Floats
     parts: Floats
-    further: Callable[[], Floats] | None = None
-    further_sums: Floats | None = None
     crossed: dict[int, Floats] = field(default_factory=dict)
-    plain: Products | None = None
-
-    @cached_property
-    def base(self) -> Floats:
-        """(blocks, k, P) with base and further columns."""
-        return self.alone if self.further is None else np.concatenate([self.alone, self.further()], axis=2)
 
     @cached_property
     def sums(self) -> Sums:
         """Base, own and target of each part."""
-        if self.plain is not None and self.further_sums is not None:
-            base, own, target = self.plain.sums
-            return np.concatenate([base, self.further_sums], axis=2), own, target
         return block_sums(self.parts, self.alone), block_sums(self.parts, self.own), self.parts @ self.target
 
-    def only(self, on: Floats) -> Products:
-        """Products of the blocks with weight 1 in `on` (blocks,) alone."""
-        wide = on[:, None, None]
-        return Products(self.base * wide, self.own * wide, self.target * on[:, None], self.parts)
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Columns beyond the base with their products. number : of no other group before or after it."""
+
+    number: int
+    rows: Rows
+    products: Products
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return self.products.own.shape[1]
+
+    @property
+    def size(self) -> int:
+        """Bytes of rows and products."""
+        return self.products.alone.nbytes + sum(values.nbytes for values in self.rows.values())
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """Products of a group's columns beside the present ones. sums : base with further columns (parts, k, P), own and
+    target of each part. columns : in the order of the blocks, or what makes them. on : (blocks,) 1 where they act.
+    """
+
+    known: Products
+    columns: Rows | Callable[[], Rows]
+    sums: Sums
+    on: Floats | None = None
+
+    def only(self, on: Floats, base: Floats) -> Beside:
+        """The same in the blocks with weight 1 in `on` (blocks,) alone. base : (blocks, k, P)."""
+        parts = self.known.parts * on
+        sums = block_sums(parts, base), block_sums(parts, self.known.own), parts @ self.known.target
+        return Beside(self.known, self.columns, sums, on)
 
 
 def width_of(rows: Rows) -> int:
@@ -95,13 +115,16 @@ def left_beside(cross: Floats, own: Floats, inverse: Floats) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def add_products(one, other, starts, weight, places, out):  # type: ignore[no-untyped-def]
-    """Add the weighted products of (r, k) and (r, l) in each block to the `places` (l,) of (blocks, k, p)."""
+def add_products(one, other, mask, starts, weight, places, into, out):  # type: ignore[no-untyped-def]
+    """Add the weighted products of (r, k) and (r, l) over the rows of `mask` (r,) in each block to the `places` (l,) of
+    (m, k, p), at the number of the block in `into` (blocks,)."""
     k, width = one.shape[1], other.shape[1]
     total = np.zeros((k, width))
     for block in range(len(starts) - 1):
         acts = False
         for row in range(starts[block], starts[block + 1]):
+            if not mask[row]:
+                continue
             for i in range(k):
                 value = weight * one[row, i]
                 if value != 0.0:
@@ -111,18 +134,21 @@ def add_products(one, other, starts, weight, places, out):  # type: ignore[no-un
         if acts:
             for i in range(k):
                 for j in range(width):
-                    out[block, i, places[j]] += total[i, j]
+                    out[into[block], i, places[j]] += total[i, j]
                     total[i, j] = 0.0
 
 
 @njit(cache=True, nogil=True)
-def add_own_products(wide, starts, weight, places, out):  # type: ignore[no-untyped-def]
-    """Add the weighted products among (r, k) in each block to the `places` (k,) of (blocks, p, p)."""
+def add_own_products(wide, mask, starts, weight, places, into, out):  # type: ignore[no-untyped-def]
+    """Add the weighted products among (r, k) over the rows of `mask` (r,) in each block to the `places` (k,) of
+    (m, p, p), at the number of the block in `into` (blocks,)."""
     width = wide.shape[1]
     total = np.zeros((width, width))
     for block in range(len(starts) - 1):
         acts = False
         for row in range(starts[block], starts[block + 1]):
+            if not mask[row]:
+                continue
             for i in range(width):
                 value = weight * wide[row, i]
                 if value != 0.0:
@@ -132,9 +158,9 @@ def add_own_products(wide, starts, weight, places, out):  # type: ignore[no-unty
         if acts:
             for i in range(width):
                 for j in range(i + 1):
-                    out[block, places[i], places[j]] += total[i, j]
+                    out[into[block], places[i], places[j]] += total[i, j]
                     if i != j:
-                        out[block, places[j], places[i]] += total[i, j]
+                        out[into[block], places[j], places[i]] += total[i, j]
                     total[i, j] = 0.0
 
 

@@ -16,8 +16,10 @@ keys = [(side, joint) for side in ("motor", "joint") for joint in range(7)]
 columns = {key: random.normal(size=(60, 2)) for key in keys}
 weights = dict(zip(keys, random.uniform(1.0, 1e3, len(keys))))
 starts = dict.fromkeys(("motor", "joint"), np.array([0, 20, 40, 60]))
-evidence = SimpleNamespace(blocks=3, _weights=weights, _starts=starts)
-print(Evidence._cross(evidence, columns, columns).tobytes().hex())
+mask = dict.fromkeys(keys, np.ones(60, dtype=bool))
+evidence = SimpleNamespace(mask=mask, _weights=weights, _starts=starts)
+joined = {key: (values, np.arange(2)) for key, values in columns.items()}
+print(Evidence._cross(evidence, columns, joined, np.arange(3), 2).tobytes().hex())
 """
 
 

@@ -55,34 +55,6 @@ def test_a_value_is_refined_between_those_beside_it(here: float, ends: tuple[flo
     assert _neighbours([-1.8, -0.7, 0.7, 1.8], here, signed=True) == pytest.approx(ends)
 
 
-def test_remembered_products_are_those_of_the_present_columns(
-    make: Callable[..., Session], chain: Chain
-) -> None:
-    bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
-    evidence = bench.evidence
-    rows = [
-        bench.dictionary.rows(Candidate(EFFECTS[cause], joint), shape)
-        for cause, joint in (("viscous_nonlinear", 0), ("joint_torque_delay", -1), ("sensor_gain", 1))
-        for shape in EFFECTS[cause].shapes(bench.dictionary.setting, max(joint, 0))[:1]
-    ]
-    columns = evidence.padded(
-        bench.dictionary.rows(
-            Candidate(EFFECTS["base_tilt"], -1), EFFECTS["base_tilt"].shapes(bench.dictionary.setting, 0)[0]
-        )
-    )
-    known = evidence.alone(columns)
-    for extra in ([rows[0], rows[1]], [rows[1]], [rows[2], rows[0], rows[1]], []):
-        evidence.replace(extra)
-        again, fresh = evidence.products(columns, known), evidence.products(columns)
-        np.testing.assert_allclose(again.base, fresh.base, atol=1e-12 * np.abs(fresh.base).max())
-        for here, there in zip(again.sums, fresh.sums, strict=True):
-            np.testing.assert_allclose(here, there, atol=1e-12 * np.abs(there).max())
-        np.testing.assert_allclose(again.sums[0], np.einsum("pb,bkl->pkl", fresh.parts, fresh.base))
-        assert again.base.shape[2] == evidence.base_count + sum(
-            next(iter(r.values())).shape[1] for r in extra
-        )
-
-
 def test_columns_by_parts_are_those_of_whole_motions(make: Callable[..., Session], chain: Chain) -> None:
     bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
     nominal, setting = bench.nominal, bench.dictionary.setting
@@ -159,7 +131,8 @@ def test_steps_of_all_sessions_are_searched_with_the_products_of_one_set_of_colu
         rows = dictionary.rows(candidate, Shape(form, time=-1.0, session=session + 1))
         for start in np.sort(evidence.block_start[evidence.block_session == session])[1:]:
             on = (evidence.block_session != session) | (evidence.block_start >= start)
-            after = evidence.products(evidence.padded(rows)).only(on.astype(float))
+            whole = evidence.products(evidence.ordered(rows))
+            after = whole.only(on.astype(float), evidence.in_blocks(whole))
             (score,) = evidence.score_products([after], [list(rows)])
             if 1.0 <= start <= dictionary.setting.durations_s[session] - 1.0:
                 here = best.get((form, session + 1), (0.0, 0.0))
