@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -29,3 +31,13 @@ def test_a_long_array_is_in_a_file() -> None:
     found = stored([long[:1000], long[1000:]])
     assert mapping(found) is not None
     assert np.array_equal(found, long)
+
+
+def test_freed_memory_is_returned_as_it_grows(monkeypatch: pytest.MonkeyPatch) -> None:
+    returned = threading.Event()
+    monkeypatch.setattr(spool, "return_freed", returned.set)
+    long = stored([np.zeros(LEAST_BYTES // 8)])
+    # Twice the growth.
+    grown = np.ones(2**24)
+    assert returned.wait(60.0)
+    assert len(long) < len(grown)
