@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from bisect import insort
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +27,7 @@ from ident.effects import NAMELESS
 from ident.effects.motion import ArmMotion
 from ident.effects.nameless import KNOTS, hats
 from ident.rows.filters import median_step
+from lwr_driver.session.spool import Arena
 
 # Lowest frequency distinguishable from a drift in a session [Hz].
 _LOWEST_HZ = 0.3
@@ -232,10 +233,10 @@ def find_remainders(
     found = []
     evidence, variables = dictionary.evidence, hats_of(dictionary)
     for one in _searched(dictionary, variables):
-        prepared: dict[str, tuple[Rows, dict[Key, Floats], Products]] = {}
+        arena, prepared = Arena(), dict[str, tuple[Rows, Products]]()
         for name, rows in one.groups.items():
-            padded = evidence.ordered(rows)
-            prepared[name] = rows, padded, evidence.alone(padded)
+            known = evidence.alone(evidence.ordered(rows))
+            prepared[name] = rows, replace(known, alone=arena.keep(known.alone))
         limits = {
             name: max(settings.least_gain, _limit(null or {}, one.side, one.joint, name))
             for name in (_ANY, *one.groups)
@@ -250,7 +251,7 @@ def find_remainders(
 def _one(
     evidence: Evidence,
     limits: Mapping[str, float],
-    prepared: dict[str, tuple[Rows, dict[Key, Floats], Products]],
+    prepared: dict[str, tuple[Rows, Products]],
     line: tuple[float, Rows, int] | None,
     side: str,
     joint: int,
@@ -273,8 +274,8 @@ def _one(
             evidence.replace([*fixed, waves])
     for _ in range(2):
         best: tuple[str, Score, Rows] | None = None
-        for name, (rows, padded, known) in prepared.items():
-            score = evidence.score(padded, ridge=_RIDGE, known=known)
+        scores = evidence.score_groups([*prepared.values()], ridge=_RIDGE)
+        for (name, (rows, _)), score in zip(prepared.items(), scores, strict=True):
             limit = max(limits[name if score.inflation > _LARGE else _ANY], beside_line)
             least = max(limit + 2.0 * KNOTS, 0.0 if best is None else best[1].gain)
             if score.gain > least and score.inflation > _LEAST_INFLATION:
@@ -363,6 +364,8 @@ def groups(
 ) -> dict[str, dict[Key, Floats]]:
     """Groups of columns by the names of their variables."""
     found: dict[str, dict[Key, Floats]] = {}
+    # All together exceed the memory.
+    arena = Arena()
     for name, curve in variables.items():
         of = name.rstrip("0123456789")
         if of in ("load", "qdd") and name != f"{of}{joint + 1}":
@@ -374,5 +377,6 @@ def groups(
         if of == "q":
             factors[f"{name} load{joint + 1}"] = lambda m: m.joint_torque[:, joint]
         columns = dictionary.nominal.functions(side, curve.of, curve.low, curve.high, [*factors.values()])
-        found |= {one: {(side, joint): values} for one, values in zip(factors, columns, strict=True)}
+        kept = map(arena.keep, columns)
+        found |= {one: {(side, joint): values} for one, values in zip(factors, kept, strict=True)}
     return found

@@ -54,7 +54,7 @@ _KEPT = 0.01
 _NO_EVIDENCE = 12.0
 
 # Memory of the latest columns that are not present [bytes].
-_SPARE_BYTES = 128 * 2**20
+_SPARE_BYTES = 64 * 2**20
 _FIRST = np.zeros(1, dtype=np.int64)
 
 _Columns = Rows | Callable[[], Rows]
@@ -382,14 +382,17 @@ class Evidence:
         products = self.products(columns, known)
         return self.score_products([products], [list(columns)], ridge=ridge, pull=pull)[0]
 
-    def score_groups(self, groups: Sequence[tuple[Rows, Products]], *, pull: float = 0.0) -> list[Score]:
+    def score_groups(
+        self, groups: Sequence[tuple[Rows, Products]], *, ridge: float = 0.0, pull: float = 0.0
+    ) -> list[Score]:
         """Scores of groups of rows, each with its products with the base alone; those of as many columns together."""
         some = [self.products(partial(self.ordered, rows), known) for rows, known in groups]
         found: dict[int, Score] = {}
         for size in {one.known.own.shape[1] for one in some}:
             alike = [k for k, one in enumerate(some) if one.known.own.shape[1] == size]
             keys = [list(groups[k][0]) for k in alike]
-            found |= zip(alike, self.score_products([some[k] for k in alike], keys, pull=pull), strict=True)
+            scores = self.score_products([some[k] for k in alike], keys, ridge=ridge, pull=pull)
+            found |= zip(alike, scores, strict=True)
         return [found[k] for k in range(len(some))]
 
     def score_products(
