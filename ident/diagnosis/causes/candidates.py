@@ -215,6 +215,7 @@ class Dictionary:
         )
         self._kept: dict[tuple[str, int], list[_Entry]] = {}
         self._whole: dict[tuple[str, int, str], _Entry | None] = {}
+        self._steps: dict[tuple[str, int, Shape], Rows] = {}
         self._pushes: dict[tuple[str, int, str], _Entry | None] = {}
         self._information: dict[tuple[str, int], dict[str, float]] = {}
         self._arena = Arena()
@@ -222,8 +223,8 @@ class Dictionary:
     def of(self, causes: Sequence[str] | None) -> Dictionary:
         """The same with fewer causes, and the columns made so far."""
         found = Dictionary(self.nominal, self.evidence, causes)
-        found._kept, found._whole, found._pushes = self._kept, self._whole, self._pushes
-        found._information, found._arena = self._information, self._arena
+        found._kept, found._whole, found._steps = self._kept, self._whole, self._steps
+        found._pushes, found._information, found._arena = self._pushes, self._information, self._arena
         return found
 
     def rows(self, candidate: Candidate, shape: Shape) -> Rows:
@@ -319,8 +320,16 @@ class Dictionary:
             return None
         # The rows themselves are made only for a step with enough gain.
         shape, score, rows = best
-        rows = rows if score.gain < _WORTH_ROWS else self.rows(candidate, shape)
+        rows = rows if score.gain < _WORTH_ROWS else self._step(candidate, shape)
         return Trial(candidate, shape, score, rows)
+
+    def _step(self, candidate: Candidate, shape: Shape) -> Rows:
+        """Rows of a step, the same beside many sets of columns."""
+        key = (*candidate.key, shape)
+        if key not in self._steps:
+            rows = self.rows(candidate, shape)
+            self._steps[key] = {place: self._arena.keep(values) for place, values in rows.items()}
+        return self._steps[key]
 
     def _grid(self, candidate: Candidate) -> Sequence[Shape]:
         return candidate.effect.shapes(self.setting, max(candidate.joint, 0))

@@ -111,7 +111,7 @@ def inverse_of(gram: Floats, scale: Floats) -> Floats:
 
 def left_beside(cross: Floats, own: Floats, inverse: Floats) -> Floats:
     """Squares (k,) of columns beside others: products with those (k, P), among themselves (k, k), inverse (P, P)."""
-    return np.asarray(np.diag(own) - np.einsum("kp,pq,kq->k", cross, inverse, cross))
+    return np.asarray(np.diag(own) - np.einsum("kp,kp->k", cross @ inverse, cross))
 
 
 @njit(cache=True, nogil=True)
