@@ -86,8 +86,8 @@ def diagnose(
         if worthless(broken):
             return _ended(task, broken)
         whole = task
-        task, first = _begun(whole)
-        contradicted = _contradicted(first.bench, reference, ready.doubts)
+        task, state = _begun(whole)
+        contradicted = _contradicted(state.bench, reference, ready.doubts)
         broken = (*broken, *contradicted)
         doubts = unconfirmed(ready.doubts, broken, chain.joint_names)
         if contradicted:
@@ -96,16 +96,18 @@ def diagnose(
                 return _ended(whole, broken)
         payloads_told = not bending(doubts)
         if contradicted or not payloads_told:
-            task, first = _begun(whole if payloads_told else without_payloads(whole))
-        others = other_masses(first.bench, reference)
-        body = None if reference is None else unstated_body(first.bench, reference)
+            task, state = _begun(whole if payloads_told else without_payloads(whole))
+        others = other_masses(state.bench, reference)
+        body = None if reference is None else unstated_body(state.bench, reference)
         if reference is not None and (others or body is not None):
             # With a mass of its own it pulls at nothing else.
             task = with_masses(task, {one.payload: one.mass for one in others})
             if body is not None:
                 task = replace(task, reference=reference.carrying(body.values, body.covariance))
-            first = _first(task, _bench(task))
-        state = _refined(task, in_time(task, first))
+            state = _first(task, _bench(task))
+        state = in_time(task, state)
+        # Of the benches, the memory holds the latest alone.
+        state = _refined(task, state)
         state = replace(state, notes=(*state.notes, *late_by_themselves(task.apart, state)))
         if reference is not None and payloads_told:
             state = replace(state, loads=tuple(payload_findings(others, body, recordings)))
