@@ -17,7 +17,7 @@ from ident.diagnosis.causes.candidates import Candidate, Dictionary
 from ident.diagnosis.gain.evidence import Evidence
 from ident.diagnosis.gain.products import Rows
 from ident.diagnosis.gain.size import USUAL_CHANGES
-from ident.diagnosis.rows.nominal_arm import NominalArm
+from ident.diagnosis.rows.nominal_arm import GAIN_STD, NominalArm
 from ident.diagnosis.settings import DiagnosisSettings
 from ident.effects import (
     DELAYS,
@@ -42,6 +42,8 @@ _ERRORS = 2.0
 _LONGEST, _APART = 5.0, 1.5
 # Largest share of friction that turns, with some room.
 _WHOLE = 1.3
+# Least gain and size in the models, in standard deviations and in those of a gain from day to day.
+_CLEAR, _MATTERS = 2.0, 0.5
 # Standard deviation of a further day from the mean of two, over that of a day.
 _FURTHER = 1.5**0.5
 
@@ -116,6 +118,16 @@ class Deviation:
     tolerance: Tolerance
     value: float
     std: float
+
+    @property
+    def lasts(self) -> bool:
+        """Whether it stays beside the columns of a model: delays and stiffness, which are no torques, and the gains of
+        the torque sensors and the sizes of the healthy effects where they are clear of zero, which the models predict
+        as on these days."""
+        if self.tolerance.delays or self.tolerance.kind is Kind.COMPLIANCE:
+            return True
+        clear = abs(self.value) > max(_CLEAR * self.std, _MATTERS * GAIN_STD)
+        return clear and self.tolerance.kind in (Kind.GAIN, Kind.SIZE)
 
 
 def tolerances(dictionary: Dictionary, settings: DiagnosisSettings) -> list[Tolerance]:

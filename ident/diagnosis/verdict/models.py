@@ -20,7 +20,6 @@ from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.healthy.bench import DiagnosisBench
 from ident.diagnosis.outcome.result import Finding, Nameless
 from ident.diagnosis.outcome.torque_errors import TorqueErrors, errors_of_both
-from ident.diagnosis.rows.nominal_arm import GAIN_STD
 from ident.diagnosis.verdict.extension import Member, held_out_with, nameless_terms
 from ident.diagnosis.verdict.task import Baseline, ModelFit, State, Task
 from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of, parameter_values, sized
@@ -30,21 +29,13 @@ from ident.model.signals import SIGNALS, signals_entry
 
 Entries = tuple[Mapping[str, Any], ...]
 
-# Least error of a sensor's gain in the models, in its standard deviations and in those from day to day.
-_CLEAR, _MATTERS = 2.0, 0.5
+# Least change of a presliding length, or of friction that turns, in its standard deviations.
+_CLEAR = 2.0
 
 
 def lasting(selection: Selection) -> list[Tolerance]:
-    """The tolerated deviations that stay beside the columns of a model: delays and stiffness, which are no torques,
-    and the gains of the torque sensors and the sizes of the healthy effects that are clear of zero, which the
-    models predict as on these days."""
-    found = []
-    for one in selection.deviations:
-        clear = abs(one.value) > max(_CLEAR * one.std, _MATTERS * GAIN_STD)
-        no_torque = one.tolerance.delays or one.tolerance.kind is Kind.COMPLIANCE
-        if no_torque or (one.tolerance.kind in (Kind.GAIN, Kind.SIZE) and clear):
-            found.append(one.tolerance)
-    return found
+    """The tolerated deviations that stay beside the columns of a model."""
+    return [one.tolerance for one in selection.deviations if one.lasts]
 
 
 class Models(NamedTuple):

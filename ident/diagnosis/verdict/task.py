@@ -86,13 +86,16 @@ class ModelFit:
 
     @classmethod
     def of(cls, evidence: Evidence, columns: Sequence[Rows], beside: Sequence[Tolerance]) -> ModelFit:
-        """Fitted with columns of the model and tolerated deviations of one column each; all stay in the evidence."""
+        """Fitted with columns of the model and tolerated deviations of one column each; those that last beside these
+        columns stay in the evidence. What is clear beside all deviations of a day may not be beside these alone."""
         evidence.replace([*columns, *(one.rows for one in beside)])
         p, values, covariance = evidence.base_count, evidence.full.values, evidence.covariance()
         first = len(values) - len(beside)
-        deviations = np.sqrt(np.maximum(np.diag(covariance)[first:], 0.0))
-        found = zip(beside, values[first:].tolist(), deviations.tolist(), strict=True)
-        return cls(values[:p].copy(), covariance[:p, :p], [Deviation(*one) for one in found])
+        std = np.sqrt(np.maximum(np.diag(covariance)[first:], 0.0))
+        found = [Deviation(*one) for one in zip(beside, values[first:].tolist(), std.tolist(), strict=True)]
+        if not all(one.lasts for one in found):
+            return cls.of(evidence, columns, [one.tolerance for one in found if one.lasts])
+        return cls(values[:p].copy(), covariance[:p, :p], found)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from ident.diagnosis.causes.selection import Selection
 from ident.diagnosis.causes.tolerances import Deviation, Kind, Tolerance
 from ident.diagnosis.rows.nominal_arm import NominalArm
 from ident.diagnosis.verdict.models import lasting, turning_friction
+from ident.diagnosis.verdict.task import ModelFit
 from ident.effects import DELAYS, PRESLIDING, entry_of
 
 
@@ -86,3 +87,37 @@ def test_what_was_found_takes_its_part_and_the_rest_may_turn_in_two_lengths() ->
 
 def test_nothing_turns_slowly_without_motor_torques() -> None:
     assert turning_friction(model(1.0, 1.0), bench(("joint",)), selection(), ()) == []
+
+
+class Fits:
+    """Evidence with a fitted value and standard deviation of each set of columns."""
+
+    base_count = 1
+
+    def __init__(self, found: dict[int, tuple[float, float]]) -> None:
+        self.found, self.extra = found, list[Any]()
+
+    def replace(self, extra: list[Any]) -> None:
+        self.extra = list(extra)
+
+    @property
+    def full(self) -> Any:
+        return SimpleNamespace(values=np.array([5.0, *(self.found[id(one)][0] for one in self.extra)]))
+
+    def covariance(self) -> np.ndarray:
+        return np.diag([0.1, *(self.found[id(one)][1] for one in self.extra)]) ** 2
+
+
+def test_a_size_that_is_not_clear_beside_the_columns_of_a_model_is_none_of_it() -> None:
+    clear, unclear, late = {("motor", 0): np.ones(1)}, {("motor", 1): np.ones(1)}, {("motor", 2): np.ones(1)}
+    beside = [
+        Tolerance(Kind.SIZE, 0, clear, 1.0),
+        Tolerance(Kind.SIZE, 1, unclear, 1.0),
+        Tolerance(Kind.DELAY, -1, late, 1.0, (DELAYS["motor"].cause, -1)),
+    ]
+    evidence: Any = Fits({id(clear): (0.4, 0.1), id(unclear): (0.5, 0.4), id(late): (0.1, 1.0)})
+    fit = ModelFit.of(evidence, [], beside)
+    assert [one.tolerance for one in fit.beside] == [beside[0], beside[2]]
+    assert [id(one) for one in evidence.extra] == [id(clear), id(late)]
+    assert fit.values.tolist() == [5.0]
+    assert fit.covariance[0, 0] == pytest.approx(0.01)
