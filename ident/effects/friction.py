@@ -141,9 +141,14 @@ class Stribeck(Effect):
     tell_apart = "a slow constant-velocity sweep of joint {joint} through 0.01 to 0.2 rad/s"
 
     def shapes(self, setting: Setting, joint: int) -> Sequence[Shape]:
-        """Speeds from 0.01 rad/s to half the largest one."""
-        speeds = [v for v in (0.01, 0.02, 0.04, 0.08, 0.16, 0.3) if v < setting.speed_range[joint]]
+        """Speeds between those of the slowest and the fastest rows."""
+        slowest, fastest = setting.standstill_rad_s, setting.speed_range[joint]
+        speeds = [v for v in (0.01, 0.02, 0.04, 0.08, 0.16, 0.3) if slowest <= v < fastest]
         return [Shape(velocity=v, exponent=e) for e in (1.0, 2.0) for v in speeds]
+
+    def least(self, setting: Setting, joint: int) -> Mapping[str, float]:
+        """Of a fall below the slowest rows these show the foot alone: the rest of it would be made up."""
+        return {"velocity": setting.standstill_rad_s}
 
     def columns(self, motion: ArmMotion, joint: int, shape: Shape) -> tuple[Column, ...]:
         """sign(v) exp(-(|v| / velocity)^exponent) in the motor torque."""

@@ -99,6 +99,12 @@ def test_torque_is_the_columns_times_the_coefficients(cause: str, motion: ArmMot
         np.testing.assert_allclose(motor, expected, atol=1e-12)
 
 
+def test_no_friction_falls_below_the_speed_of_the_slowest_rows() -> None:
+    stribeck, slowest = EFFECTS["stribeck"], replace(setting(), standstill_rad_s=0.05)
+    assert min(shape["velocity"] for shape in stribeck.shapes(slowest, 1)) == 0.08
+    assert stribeck.least(slowest, 1)["velocity"] == 0.05
+
+
 def test_sensor_causes_leave_the_motor_torque_alone(motion: ArmMotion) -> None:
     for cause in TABLE["sensor"]:
         assert all(c.motor is None for c in EFFECTS[cause].columns(motion, 1, shapes(cause)[0]))
