@@ -115,11 +115,12 @@ class Nominal:
     def refine(self, values: Floats) -> None:
         """Predict the torques with the base parameters (b,) and make the rows anew."""
         model = DynamicModel("arm", self.structure, self.base.names, values, None, self.base)
-        predictor = self._predictor
+        predictor, drive = self._predictor, model.drive()
+        bodies = {payload: model.inertial(payload) for payload in {r.payload for r in self.recordings}}
         self.motions = in_order(
             [
-                predictor.again(before, *pair, model)
-                for before, pair in zip(self.motions, self.stretches, strict=True)
+                predictor.again(before, recording, stretch, bodies[recording.payload], drive)
+                for before, (recording, stretch) in zip(self.motions, self.stretches, strict=True)
             ]
         )
         self._pieces.clear()

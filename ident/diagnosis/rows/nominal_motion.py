@@ -15,7 +15,6 @@ from ident.diagnosis.rows.recording import RecordStretch, SessionRecord
 from ident.dynamics import regressor
 from ident.effects.motion import ArmMotion, Floats
 from ident.effects.springs import Springs
-from ident.model.dynamic_model import DynamicModel
 from ident.rows.filters import differentiate, low_pass, settling
 from lwr_driver.session.spool import spans, stored, stored_together
 
@@ -39,10 +38,14 @@ class Predictor:
     bare: bool
 
     def again(
-        self, before: ArmMotion, recording: SessionRecord, stretch: RecordStretch, model: DynamicModel
+        self,
+        before: ArmMotion,
+        recording: SessionRecord,
+        stretch: RecordStretch,
+        bodies: Floats,
+        drive: Mapping[str, Floats],
     ) -> ArmMotion:
-        """A motion with the torques of a model; its links hang on the torque along the motion `before`."""
-        bodies, drive = model.inertial(recording.payload), model.drive()
+        """A motion with other bodies and drives; its links hang on the torque along the motion `before`."""
         parts = (before.part(some) for some in spans(len(before.time), _BLOCK))
         link = stored(self._link_torque(one.q, one.qd, one.qdd, bodies, drive) for one in parts)
         return self.motion(recording, stretch, link, bodies, drive)

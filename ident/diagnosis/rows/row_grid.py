@@ -39,7 +39,7 @@ class Sampling:
         """Times (N,) [s] of the motion that the samples tell of."""
         return self.stamp - self.delay_s
 
-    @property
+    @cached_property
     def step_s(self) -> float:
         """Distance of the bins [s]."""
         return self.width * usual_step(self.stamp) if len(self.stamp) > 1 else 0.0
@@ -58,6 +58,8 @@ class RowGrid:
     most_s: float
     delay_s: Mapping[str, float]
     _operators: dict[tuple[str, int], csr_array] = field(default_factory=dict, init=False, repr=False)
+    _samplings: dict[tuple[str, int], Sampling] = field(default_factory=dict, init=False, repr=False)
+    _chosen: dict[tuple[str, int], NDArray[np.bool_]] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def stretches(self) -> list[tuple[SessionRecord, RecordStretch]]:
@@ -87,7 +89,12 @@ class RowGrid:
 
     def sampling(self, side: str, number: int) -> Sampling:
         """Samples of a side in a motion."""
-        _, stretch = self.stretches[number]
+        key = (side, number)
+        if key not in self._samplings:
+            self._samplings[key] = self._sampled(side, self.stretches[number][1])
+        return self._samplings[key]
+
+    def _sampled(self, side: str, stretch: RecordStretch) -> Sampling:
         if side == "joint":
             dt = float(stretch.time[1] - stretch.time[0])
             return Sampling(stretch.time, self.delay_s[side], max(1, round(self.bin_s / dt)))
@@ -147,8 +154,11 @@ class RowGrid:
     def slow(self, side: str, number: int, rows: Floats, *, smooth: bool = True) -> Floats:
         """All rows (m, ...) of a motion, low-passed if `smooth`, thinned and without spoiled ends where the torques
         were low-passed before."""
-        cutoff, dt = self.band_hz[side], self.sampling(side, number).step_s
-        if cutoff is None or cutoff >= 0.4 / dt:
+        cutoff = self.band_hz[side]
+        if cutoff is None:
+            return rows
+        dt = self.sampling(side, number).step_s
+        if cutoff >= 0.4 / dt:
             return rows
         rows = low_pass(rows, dt, cutoff) if smooth else rows
         step, edge = max(1, int(0.4 / (cutoff * dt))), int(0.5 / (cutoff * dt))
@@ -162,7 +172,12 @@ class RowGrid:
     def chosen(self, side: str, number: int) -> NDArray[np.bool_]:
         """Rows (m,) of a motion in use. Of a long session: the beginning, two periods at least, and windows spread
         evenly, so that drifts are seen and the rows stay within memory."""
-        recording, stamps = self.stretches[number][0], self.stamps(side, number)
+        key = (side, number)
+        if key not in self._chosen:
+            self._chosen[key] = self._spread(self.stretches[number][0], self.stamps(side, number))
+        return self._chosen[key]
+
+    def _spread(self, recording: SessionRecord, stamps: Floats) -> NDArray[np.bool_]:
         share = self.most_s / len(self.recordings)
         if recording.duration_s <= share:
             return np.ones(len(stamps), dtype=bool)

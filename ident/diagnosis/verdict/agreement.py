@@ -11,7 +11,7 @@ import numpy as np
 from ident.diagnosis.causes.candidates import Dictionary
 from ident.diagnosis.causes.claims import Claim
 from ident.diagnosis.causes.sufficiency import powers
-from ident.diagnosis.gain.products import Floats, Key
+from ident.diagnosis.gain.products import Floats, Key, Rows
 
 # Least standard deviations from zero of the torque of a claim on the other side, and its range in sizes of the claim.
 _SEEN, _SIZES = 3.0, (0.5, 2.0)
@@ -29,8 +29,7 @@ def on_both_sides(dictionary: Dictionary, claim: Claim) -> bool:
     trial = claim.trial
     if len({side for side, _ in trial.rows}) > 1 or len(dictionary.nominal.rows) < 2:
         return False
-    rows = dictionary.turned(trial.candidate, trial.shape)
-    torque = {key: columns @ claim.score.coefficients[:, None] for key, columns in rows.items()}
+    torque = _torque(claim, dictionary.turned(trial.candidate, trial.shape))
     if not any(np.any(column) for column in torque.values()):
         return False
     score = dictionary.evidence.score(dictionary.evidence.ordered(torque))
@@ -48,7 +47,7 @@ def uneven(dictionary: Dictionary, claim: Claim) -> bool:
     shown = sorted((key for key in power if power[key] > _SHOWN * total), key=lambda key: power[key])
     if len(shown) < 2:
         return False
-    own, torque = len(shown) - 1, _torque(claim)
+    own, torque = len(shown) - 1, _torque(claim, claim.trial.rows)
     columns = {key: np.zeros((len(torque[key]), own)) for key in shown[:-1]}
     for k, key in enumerate(shown[:-1]):
         columns[key][:, k] = torque[key][:, 0]
@@ -67,11 +66,11 @@ def in_one_joint(dictionary: Dictionary, claim: Claim) -> bool:
         return False
     power = powers(claim.trial, dictionary)
     _, main = max(power, key=lambda key: power[key])
-    torque = {key: column for key, column in _torque(claim).items() if key[1] == main}
+    torque = {key: column for key, column in _torque(claim, claim.trial.rows).items() if key[1] == main}
     score = dictionary.evidence.score(dictionary.evidence.ordered(torque))
     return not np.isfinite(score.gain) or float(score.covariance[0, 0]) > _KNOWN**2
 
 
-def _torque(claim: Claim) -> dict[Key, Floats]:
-    """Torque (m, 1) [Nm] of a claim by side and joint."""
-    return {key: columns @ claim.score.coefficients[:, None] for key, columns in claim.trial.rows.items()}
+def _torque(claim: Claim, rows: Rows) -> dict[Key, Floats]:
+    """Torque (m, 1) [Nm] of a claim with such rows, by side and joint."""
+    return {key: columns @ claim.score.coefficients[:, None] for key, columns in rows.items()}
