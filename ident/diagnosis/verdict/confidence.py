@@ -24,6 +24,8 @@ WEIGHTS = "confidence.yaml"
 ALONE = "confidence_alone.yaml"
 """Of those without one: an earlier fit to findings against a healthy arm, borne out by recordings of real arms."""
 
+OPEN = 0.7
+"""Largest confidence in a claim that a test leaves open."""
 HARDLY = 0.5
 """Least probability of a finding: more likely right than wrong."""
 
@@ -39,8 +41,8 @@ class Grounds:
     felt : share of the held-out error of its rows that the claim takes away. one_block : 1 if one block shows all of
     it. worse : 1 if a row becomes worse beyond chance, see `held_out.worse_rows`. rest : unexplained gain in its rows
     over its own. replaceable : share of its gain explained by unnamed functions of the motion. habitual : 1 for a cause
-    that healthy drives have. company : number of claims of more gain. alone : 1 without a healthy arm, with weights
-    of its own.
+    that healthy drives have. company : number of claims of more gain. held : 1 where a test leaves the claim open, such
+    as held-out rows that do not show it plainly. alone : 1 without a healthy arm, with weights of its own.
     """
 
     gain: float
@@ -55,6 +57,7 @@ class Grounds:
     replaceable: float = 0.0
     habitual: float = 0.0
     company: float = 0.0
+    held: float = 0.0
     alone: float = 0.0
 
     def to_dict(self) -> dict[str, float]:
@@ -75,6 +78,7 @@ LIMITS: Mapping[str, tuple[float, float]] = {
     "replaceable": (0.0, 1.0),
     "habitual": (0.0, 1.0),
     "company": (0.0, 3.0),
+    "held": (0.0, 1.0),
 }
 """Range of each ground; beyond it says no more than its end."""
 
@@ -91,6 +95,7 @@ SIGNS: Mapping[str, int] = {
     "replaceable": -1,
     "habitual": -1,
     "company": -1,
+    "held": -1,
 }
 """Sign of each weight, 0 where both are possible."""
 
@@ -108,12 +113,13 @@ START: Mapping[str, float] = {
     "replaceable": -1.5,
     "habitual": -1.0,
     "company": -0.5,
+    "held": -1.0,
 }
 """Weights before any finding, by judgement; a fit to few findings stays near them. Their intercept is -1.5."""
 
 
 def scaled(grounds: Mapping[str, float]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """The grounds (12,) from 0 to 1 over their ranges, in the order of `LIMITS`."""
+    """The grounds (13,) from 0 to 1 over their ranges, in the order of `LIMITS`."""
     return np.array(
         [(min(max(grounds[name], low), high) - low) / (high - low) for name, (low, high) in LIMITS.items()]
     )
@@ -130,12 +136,12 @@ def probability(grounds: Grounds) -> float:
     """Probability of a finding with these grounds to be right."""
     intercept, weights = fitted(ALONE if grounds.alone else WEIGHTS)
     odds = intercept + float(weights @ scaled(asdict(grounds)))
-    return 1.0 / (1.0 + math.exp(-odds))
+    return min(1.0 / (1.0 + math.exp(-odds)), OPEN if grounds.held else 1.0)
 
 
 @cache
 def fitted(name: str = WEIGHTS) -> tuple[float, np.ndarray[Any, np.dtype[np.float64]]]:
-    """Intercept and weights (12,), in the order of `LIMITS`, of a file of this folder."""
+    """Intercept and weights (13,), in the order of `LIMITS`, of a file of this folder."""
     text = (resources.files("ident.diagnosis.verdict") / name).read_text(encoding="utf-8")
     content = yaml_content(text)
     if set(content["weights"]) != set(LIMITS):

@@ -22,8 +22,6 @@ from ident.diagnosis.verdict.findings import finding_of, timing_finding
 from ident.diagnosis.verdict.task import State, Task
 from ident.estimators.estimate import fisher_tail
 
-OPEN = 0.7
-"""Largest confidence in a claim that the held-out rows do not show plainly."""
 # Its least gain over the usual one.
 _TO_SPARE = 2.0
 # Lowest tolerated lower bound of the held-out gain, as a share of its upper bound; with hardly any excitation in the
@@ -50,12 +48,11 @@ _EXCITED = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Confirmed:
-    """A claim not refuted by held-out rows. most : the largest confidence that they allow."""
+    """A claim not refuted by held-out rows."""
 
     claim: Claim
     finding: Finding
     grounds: Grounds
-    most: float
 
 
 def confirmed(task: Task, state: State) -> tuple[list[Confirmed], list[Finding]]:
@@ -84,8 +81,7 @@ def confirmed(task: Task, state: State) -> tuple[list[Confirmed], list[Finding]]
         untested = _untested(claim) or hardly
         grounds = _grounds(claim, claims, finding, bench, without, after, fallen, untested, seed)
         plain = not at_odds[k] and _plain(claim, finding, bench, grounds, fallen)
-        most = 1.0 if plain else OPEN
-        kept.append(Confirmed(claim, finding, grounds, most))
+        kept.append(Confirmed(claim, finding, replace(grounds, held=float(not plain))))
     return kept, refuted
 
 
@@ -103,20 +99,16 @@ def doubted(
         left = sum(r.gain for r in doubts if (r.side, r.joint - 1) in mine)
         if len(mine) > bench.nominal.arm.chain.n:
             left /= 2.0
-        grounds = replace(
-            one.grounds,
-            rest=left / claim.gain,
-            replaceable=_encompassed(claim, [*others, *nuisance], bench, doubts),
-        )
+        replaceable = _encompassed(claim, [*others, *nuisance], bench, doubts)
         # No held-out session confirms a change between sessions, and a dependence on the motion is similar to one.
         like = claim.trial.passing and bool(unnamed & mine)
         strange = not _familiar(claim, bench)
-        open_ = like or strange or grounds.replaceable > _REPLACEABLE or _bent(claim, remainders)
+        open_ = like or strange or replaceable > _REPLACEABLE or _bent(claim, remainders)
         open_ = open_ or _one_way(claim, [c.claim for c in kept])
-        most = min(one.most, claim.confidence, OPEN if open_ else 1.0)
-        findings.append(
-            replace(one.finding, confidence=min(most, probability(grounds)), grounds=grounds.to_dict())
-        )
+        held = max(one.grounds.held, float(open_))
+        grounds = replace(one.grounds, rest=left / claim.gain, replaceable=replaceable, held=held)
+        confidence = min(claim.confidence, probability(grounds))
+        findings.append(replace(one.finding, confidence=confidence, grounds=grounds.to_dict()))
     return findings
 
 
@@ -159,8 +151,8 @@ def _bent(claim: Claim, remainders: Sequence[Remainder]) -> bool:
 
 def contradicted(finding: Finding) -> Finding:
     """The finding with the confidence left where its torque raises the torque error of held-out sessions."""
-    grounds = {**finding.grounds, "worse": 1.0}
-    confidence = min(finding.confidence, OPEN, probability(Grounds(**grounds)))
+    grounds = {**finding.grounds, "worse": 1.0, "held": 1.0}
+    confidence = min(finding.confidence, probability(Grounds(**grounds)))
     return replace(finding, confidence=confidence, grounds=grounds)
 
 
@@ -188,7 +180,8 @@ def confirmed_delay(
     )
     low, high = finding.evidence.gain_interval_95
     grounds = _grounds(claim, selection.claims, finding, bench, before, now, (low, high), False, seed)
-    confidence = min(claim.confidence, probability(grounds), 1.0 if _seen(low, grounds) else OPEN)
+    grounds = replace(grounds, held=float(not _seen(low, grounds)))
+    confidence = min(claim.confidence, probability(grounds))
     return replace(finding, confidence=confidence, grounds=grounds.to_dict())
 
 

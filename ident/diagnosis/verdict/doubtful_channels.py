@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from ident.diagnosis.outcome.result import Diagnosis, Finding
 from ident.diagnosis.rows.broken_data import BrokenChannel
-from ident.diagnosis.verdict.confirmation import OPEN
+from ident.diagnosis.verdict.confidence import OPEN
 from ident.diagnosis.verdict.task import Task
 from ident.effects import (
     DELAYS,

@@ -9,7 +9,7 @@ import pytest
 
 from ident.diagnosis.outcome.result import Finding, FindingEvidence
 from ident.diagnosis.rows.broken_data import BrokenChannel
-from ident.diagnosis.verdict.confirmation import OPEN
+from ident.diagnosis.verdict.confidence import OPEN
 from ident.diagnosis.verdict.doubtful_channels import bending, held_back, unconfirmed, without_payloads
 from ident.diagnosis.verdict.task import Task
 from ident.screening.doubts import Doubt
