@@ -37,6 +37,8 @@ from lwr_driver.session.spool import Growing, release
 _DRAWN = 3000
 """Most samples of a trace."""
 
+BLOCK_S = 2.0
+"""Length of blocks with independent errors [s]."""
 Predictor = Callable[[TorqueChannel, Side], Floats]
 """The torque (N, n) [Nm] of a side at the samples of a channel, from its times and motion."""
 
@@ -108,6 +110,7 @@ class SessionScore(Tabular):
     seen : whether the model was fitted to this session. relative : by side, the torque error of all joints.
     moving_relative : by side, moving samples only. standstill, standstill_error : by side, share of standstill in
         the samples and in the squared error. band_hz : upper end of the band. traces : by side, for `plot`.
+    squares : by side, (B, n) sums of squares of the residual in blocks of `BLOCK_S` from the start of the session.
     """
 
     session: str
@@ -123,6 +126,7 @@ class SessionScore(Tabular):
     band_hz: float
     notes: tuple[str, ...] = ()
     traces: Mapping[str, Trace] = field(default_factory=dict, repr=False, compare=False)
+    squares: Mapping[str, Floats] = field(default_factory=dict, repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain content for JSON."""
@@ -296,6 +300,7 @@ def score_session(
     names = ("relative", "moving_relative", "standstill", "standstill_error")
     figures: dict[str, dict[str, float]] = {name: {} for name in names}
     traces: dict[str, Trace] = {}
+    squares: dict[str, Floats] = {}
     for side in sides:
         # A motor-only session has no joint torque; its prepared one is a placeholder.
         if side != "motor" and not session.joint.effort.shape[1]:
@@ -323,6 +328,10 @@ def score_session(
             np.column_stack([c.torque[thin] for c in columns]),
             np.column_stack([np.where(c.used, c.torque - c.error, np.nan)[thin] for c in columns]),
         )
+        block = np.maximum(times // BLOCK_S, 0.0).astype(np.int64)
+        squares[side] = np.column_stack(
+            [np.bincount(block, np.where(c.used, c.error, 0.0) ** 2) for c in columns]
+        )
         power = np.sum([c.power for c in columns], axis=0)
         figures["relative"][side] = math.sqrt(_ratio(power[0], power[1]))
         figures["moving_relative"][side] = math.sqrt(_ratio(power[2], power[3]))
@@ -348,6 +357,7 @@ def score_session(
         band_hz=prepared.settings.decimate,
         notes=notes,
         traces=traces,
+        squares=squares,
     )
 
 

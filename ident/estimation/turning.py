@@ -179,11 +179,12 @@ class _Sums:
         n = error.shape[1]
         cross, square = np.zeros((2, 2, len(starts), n, len(_LENGTHS)))
         squared = np.zeros((2, len(starts), n))
-        law = model.structure.coulomb(channel.qd)
+        speeds = channel.qd if channel.drive is None else channel.drive.speed
+        law = model.structure.coulomb(speeds)
         away = away_from_reversals(channel.qd, channel.period_s, 0.0, STILL_RAD_S, TURNING_RAD)
         for joint in range(n):
-            # As the model computes it: behind elastic joints the path of the link stands for that of the drive.
-            path, speed = channel.q[:, joint], channel.qd[:, joint]
+            speed = speeds[:, joint]
+            path = channel.q[:, joint] if channel.drive is None else np.cumsum(speed) * channel.period_s
             counted = np.array([used[:, joint], used[:, joint] & away[:, joint]])
             own = error[:, joint] * counted
             squared[:, :, joint] = np.add.reduceat(own**2, starts, axis=1)

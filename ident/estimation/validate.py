@@ -23,7 +23,7 @@ from ident.estimation.identify import identify
 from ident.estimation.scores import Predictor, SessionScore, score_session
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import Model, as_model
-from ident.model.signals import signal_settings
+from ident.model.signals import signal_settings, softened, taken_back
 from ident.rows.content import Recall
 from ident.rows.filters import SignalSettings
 from ident.rows.prepare import prepare
@@ -249,20 +249,29 @@ def _has_motor(model: DynamicModel) -> bool:
 def signals_for(
     model: DynamicModel, settings: SignalSettings | None = None, *, estimate_delay: bool = False
 ) -> SignalSettings:
-    """The given signal settings, else those of the model, else the defaults.
+    """The given signal settings, else those of the model with the links where its effects have them, else the defaults.
 
     estimate_delay : without the model's delay of the motor channel.
     """
-    chosen = settings or signal_settings(model) or SignalSettings()
+    chosen = settings or softened(signal_settings(model) or SignalSettings(), model)
     return replace(chosen, motor_delay_s="estimate") if estimate_delay else chosen
 
 
 def predictor(model: DynamicModel, payload: str | None) -> Predictor:
     """The computed torque of a model with a payload mounted."""
+    twisted = taken_back(model)
+    behind = replace(model, effects=tuple(e for e in model.effects if e not in twisted)) if twisted else model
 
     def predict(channel: TorqueChannel, side: Side) -> Floats:
-        return model.torque(
-            channel.q, channel.qd, channel.qdd, payload=payload, side=side, time=channel.times, measured=True
+        return (behind if channel.taken_back else model).torque(
+            channel.q,
+            channel.qd,
+            channel.qdd,
+            payload=payload,
+            side=side,
+            time=channel.times,
+            measured=True,
+            drive=channel.drive,
         )
 
     return predict

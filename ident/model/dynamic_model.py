@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +14,7 @@ from fri.errors import ConfigurationError
 from ident.dynamics import regressor
 from ident.dynamics.base_set import BaseSet
 from ident.dynamics.parameters import INERTIAL, PER_LINK, Floats
-from ident.dynamics.structure import Condition, ModelStructure, Side
+from ident.dynamics.structure import Condition, DriveMotion, ModelStructure, Side
 from ident.dynamics.tables import Tabular
 from ident.effects import check_entry, effects_torque, find_effect
 from ident.effects.motion import ArmMotion
@@ -208,24 +208,30 @@ class DynamicModel(Tabular):
         side: Side | None = None,
         time: ArrayLike | None = None,
         measured: bool = False,
+        drive: DriveMotion | None = None,
     ) -> Floats:
         """Inverse dynamics (N, n) [Nm, N] of one side (default the structure's first), equations (1) to (4),
         with the model's effects.
 
         q, qd, qdd : (N, n). payload : the payload mounted, one of the structure's. time : (N,) [s], evenly
         spaced, for effects with a memory; default 1 ms steps. measured : add the errors of the sensors.
+        drive : motion of the motors behind elastic joints; default that of the links.
         """
         position, speed, acceleration = regressor.check_states(self.structure.chain, q, qd, qdd)
         chosen = self.structure.sides[0] if side is None else side
-        torque: Floats = self.linear_torque(position, speed, acceleration, payload=payload, side=chosen)
+        linear_torque = partial(
+            self.linear_torque, position, speed, acceleration, payload=payload, drive=drive
+        )
+        torque: Floats = linear_torque(side=chosen)
         if self.effects:
             linear: dict[str, Floats] = {chosen: torque}
             for of in set(self.structure.sides) - {chosen, "difference"}:
-                linear[of] = self.linear_torque(position, speed, acceleration, payload=payload, side=of)
+                linear[of] = linear_torque(side=of)
             stamps: Floats = np.arange(len(position), dtype=np.float64) * 1e-3
             if time is not None:
                 stamps = np.asarray(time, dtype=np.float64)
-            motion = self._motion(position, speed, acceleration, linear, payload, stamps)
+            moved = drive or DriveMotion(speed, acceleration)
+            motion = self._motion(position, speed, acceleration, moved, linear, payload, stamps)
             torque = torque + effects_torque(self.effects, motion, side=chosen, measured=measured)
         return torque
 
@@ -234,11 +240,15 @@ class DynamicModel(Tabular):
         q: Floats,
         qd: Floats,
         qdd: Floats,
+        moved: DriveMotion,
         linear: Mapping[str, Floats],
         payload: str | None,
         time: Floats,
     ) -> ArmMotion:
-        """The motion as the effects see it. linear : torque (N, n) of the linear model by side."""
+        """The motion as the effects see it.
+
+        moved : of the motors. linear : torque (N, n) of the linear model by side.
+        """
         chain, drive = self.structure.chain, self.drive()
         bodies = self.inertial(payload)
         joint = linear.get("joint")
@@ -258,8 +268,8 @@ class DynamicModel(Tabular):
             q=q,
             qd=qd,
             qdd=qdd,
-            motor_speed=qd,
-            motor_acceleration=qdd,
+            motor_speed=moved.speed,
+            motor_acceleration=moved.acceleration,
             joint_torque=joint,
             motor_torque=linear.get("motor", joint),
             gear_ratio=np.ones(chain.n),
@@ -267,7 +277,7 @@ class DynamicModel(Tabular):
             link_coulomb=drive["Fcl"],
             motor_coulomb=drive["Fcm"],
             friction=friction,
-            slip=self.structure.coulomb(qd),
+            slip=self.structure.coulomb(moved.speed) if moved.slip is None else moved.slip,
             loaded=self.loaded(payload),
         )
 
@@ -279,14 +289,21 @@ class DynamicModel(Tabular):
         *,
         payload: str | None = None,
         side: Side | None = None,
+        drive: DriveMotion | None = None,
     ) -> Floats:
         """Inverse dynamics (N, n) of the linear model, without its effects; arguments as in `torque`."""
         chosen = self.structure.sides[0] if side is None else side
         chosen = self.structure.condition_sides(Condition(payload, (chosen,)))[0]
         position, speed, acceleration = regressor.check_states(self.structure.chain, q, qd, qdd)
+        of_links, of_drives = self._signal_weights[chosen]
         signals = np.empty((self.structure.n_signals, self.structure.chain.n, len(position)))
         self.structure.signals(speed, acceleration, signals)
-        torque = np.einsum("jk,kjs->sj", self._signal_weights[chosen], signals)
+        if drive is None:
+            torque = np.einsum("jk,kjs->sj", of_links + of_drives, signals)
+        else:
+            torque = np.einsum("jk,kjs->sj", of_links, signals)
+            self.structure.signals(drive.speed, drive.acceleration, signals, drive.slip)
+            torque += np.einsum("jk,kjs->sj", of_drives, signals)
         if chosen != "difference":
             torque += regressor.torque(
                 self.structure.chain, position, speed, acceleration, self.inertial(payload)
@@ -295,15 +312,17 @@ class DynamicModel(Tabular):
 
     @cached_property
     def _signal_weights(self) -> dict[Side, Floats]:
-        """For each side, (n, n_signals) factors of qdd, qd, sign(qd), 1 and the couplings' signals."""
+        """For each side, (2, n, n_signals) factors of qdd, qd, sign(qd), 1 and the couplings' signals, those of the
+        links' motion and those of the motors'."""
         table: dict[Side, Floats] = {}
         for side in self.structure.sides:
-            weights = np.zeros((self.structure.chain.n, self.structure.n_signals))
+            weights = np.zeros((2, self.structure.chain.n, self.structure.n_signals))
             for column in np.flatnonzero(self.standard):
                 for joint in range(self.structure.chain.n):
                     signal = self.structure.signal_of(int(column), side, joint)
                     if signal is not None:
-                        weights[joint, signal] += self.standard[column]
+                        of_drive = int(self.structure.of_drive(int(column)))
+                        weights[of_drive, joint, signal] += self.standard[column]
             table[side] = weights
         return table
 

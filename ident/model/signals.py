@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from fri.errors import ConfigurationError
+from ident.effects import ELASTICITY, parameter_values
 from ident.model.dynamic_model import DynamicModel
 from ident.rows.delay import shared_delay
 from ident.rows.filters import SignalSettings
@@ -42,6 +43,27 @@ def positions_of_motors(model: DynamicModel) -> bool:
     """Whether a model takes the positions for those of the motors."""
     settings = signal_settings(model)
     return settings is not None and settings.takes_links_back
+
+
+def taken_back(model: DynamicModel) -> tuple[Mapping[str, Any], ...]:
+    """Effects of a model whose twist is taken back with the links, see `softened`: joints softer than the signal
+    settings say, behind encoders at the motors."""
+    form = ELASTICITY.at_encoder("motor").form
+    assert form is not None
+    return tuple(
+        one for one in model.effects if one["cause"] == ELASTICITY.cause and one.get("form") == form.value
+    )
+
+
+def softened(settings: SignalSettings, model: DynamicModel) -> SignalSettings:
+    """Settings that take the links back by the twist that the model's effects add, too: from the measured torque, in
+    which the links ring."""
+    if settings.stiffness_nm_rad is None or not settings.takes_links_back:
+        return settings
+    compliance = 1.0 / np.array(settings.stiffness_nm_rad)
+    for entry in taken_back(model):
+        compliance[[joint - 1 for joint in entry["joints"]]] += parameter_values(entry)["compliance"]
+    return dataclasses.replace(settings, stiffness_nm_rad=tuple((1.0 / compliance).tolist()))
 
 
 def signal_settings(model: DynamicModel) -> SignalSettings | None:

@@ -211,8 +211,18 @@ class Motion:
         part = slice(first - self.low, max(last, first) - self.low)
         times, flagged = self.times[part] - settings.joint_delay, self.flagged[part]
         q, qd, qdd, away = self._at(times)
+        taken_back = settings.takes_links_back and self.drive is not None
         return TorqueChannel(
-            "joint", times, q, qd, qdd, self.torque[part], flagged, away & ~flagged, period_s=self.dt
+            "joint",
+            times,
+            q,
+            qd,
+            qdd,
+            self.torque[part],
+            flagged,
+            away & ~flagged,
+            period_s=self.dt,
+            taken_back=taken_back,
         )
 
     def _at(self, times: Floats) -> tuple[Floats, Floats, Floats, BoolArray]:
@@ -257,9 +267,9 @@ class Motion:
         if self.drive is not None:
             moved = (self.drive.speed, self.drive.acceleration)
             drive = DriveMotion(*(interpolate_uniform(state, self.first, self.dt, actual) for state in moved))
-        known = away & ~flagged
+        known, taken_back = away & ~flagged, settings.takes_links_back and drive is not None
         return TorqueChannel(
-            "motor", actual, q, qd, qdd, torque[inside], flagged, known, drive, period_s=period
+            "motor", actual, q, qd, qdd, torque[inside], flagged, known, drive, period, taken_back
         )
 
 

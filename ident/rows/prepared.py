@@ -26,7 +26,8 @@ class TorqueChannel:
 
     times : (m,) [s], delay removed. q, qd, qdd, torque : (m, J). flagged : (m, J), bridged or outliers.
     known : (m, J), neither flagged nor beside a reversal of their joint. drive : motion of the motors
-    where it is known to differ from the links', else None. period_s : median time between samples [s].
+    where it is known to differ from the links', else None. period_s : median time between samples [s]. taken_back :
+    whether the motion is that of the links, taken back from positions of the motors.
     """
 
     side: str
@@ -39,6 +40,7 @@ class TorqueChannel:
     known: BoolArray
     drive: DriveMotion | None = None
     period_s: float = float("nan")
+    taken_back: bool = False
 
     @property
     def arrays(self) -> tuple[Floats | BoolArray, ...]:

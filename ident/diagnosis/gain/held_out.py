@@ -107,13 +107,18 @@ def spread_out(before: HeldOut, after: HeldOut, keys: Sequence[Key]) -> bool:
 
 
 def worse_rows(
-    before: HeldOut, after: HeldOut, seed: int, acting: Collection[Key] | None = None
+    before: HeldOut,
+    after: HeldOut,
+    seed: int,
+    acting: Collection[Key] | None = None,
+    usual: Mapping[str, Floats] | None = None,
 ) -> list[Key]:
     """Sides and joints with a larger error after than before: by 5 %, or by 1 % and beyond chance for the worst of all
     rows, once in twenty.
 
     acting : rows on which the cause in question acts, default all. The others change with the shared base parameters
-    alone, and count where the error is both larger by 5 % and beyond chance.
+    alone, and count where the error is both larger by 5 % and beyond chance. usual : error (n,) [Nm] by side that
+    healthy days leave; up to it the others do not count at all, for a healthy arm is as wrong there.
     """
     keys = [
         (side, joint)
@@ -126,6 +131,8 @@ def worse_rows(
     worse = []
     for key, (a, b, _, high) in found.items():
         sure, acts = high < 0.0, acting is None or key in acting
+        if not acts and usual and key[0] in usual and b <= usual[key[0]][key[1]]:
+            continue
         if (sure or acts) and b > (1.0 + (FELT_WORSE if sure and acts else _MUCH_WORSE)) * a:
             worse.append(key)
     return worse

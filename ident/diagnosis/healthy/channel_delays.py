@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -33,13 +32,10 @@ def channel_delays(
     """Delays of the channels as `identify` finds them: from rows away from reversals, where presliding, which looks
     like a delay, has no part. Without those that the rows do not tell.
     """
-    springs = None
-    if np.any(arm.compliance > 0.0):
-        springs = tuple((1.0 / np.maximum(arm.compliance, 1e-12)).tolist())
     wanted = IdentificationSettings(
         model=2 if any(session.motor is not None for session in sessions) else 1,
         estimator="wls",
-        signals=replace(settings.signals, stiffness_nm_rad=springs, encoder=arm.encoder),
+        signals=arm.elastic(settings.signals),
         coulomb=settings.law,
         row_coulomb=settings.row_law,
         couplings=arm.couplings,

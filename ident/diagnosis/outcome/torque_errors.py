@@ -15,6 +15,8 @@ from ident.estimation.validate import validate
 from ident.model import DynamicModel
 from lwr_driver.session import Session
 
+_DRAWS = 1000
+
 
 class TorqueErrors(NamedTuple):
     """Errors with all samples, as `validate` measures them: relative ones by session and side, and the rms [Nm] by
@@ -42,7 +44,8 @@ class TorqueErrors(NamedTuple):
         one where the base model has none.
 
         At a reversal and at rest any model is wrong by up to twice the friction, and those samples are most of the
-        mean square. So one is the most where no joint's error is felt to be larger and that in motion falls by more.
+        mean square. So where no joint's error is felt to be larger, one is the most if that in motion falls by more, or
+        if the rise is within its interval.
         """
         if not np.isfinite(base.joints).any():
             return 1.0
@@ -50,7 +53,20 @@ class TorqueErrors(NamedTuple):
             return np.inf
         left, moving = _mean_square(self.joints, base.joints), _mean_square(self.moving, base.moving)
         felt = bool(np.any(self.joints > (1.0 + FELT_WORSE) * base.joints))
-        return 1.0 if 1.0 < left <= 2.0 - moving and not felt else left
+        if left <= 1.0 or felt:
+            return left
+        return 1.0 if left <= 2.0 - moving or self._by_chance(base) else left
+
+    def _by_chance(self, base: TorqueErrors) -> bool:
+        """Whether blocks drawn with replacement leave less than the base model once in forty."""
+        rng, shares = np.random.default_rng(1), list[Floats]()
+        for own, theirs in zip(self.scores, base.scores, strict=True):
+            a, b = _table(own), _table(theirs)
+            if a.shape == b.shape and len(a):
+                drawn = rng.integers(0, len(a), (_DRAWS, len(a)))
+                shares.append(a[drawn].sum(axis=1) / np.maximum(b[drawn].sum(axis=1), 1e-24))
+        left = np.concatenate(shares, axis=1) if shares else np.ones((1, 0))
+        return bool(left.size) and float(np.quantile(left.mean(axis=1), 0.025)) <= 1.0
 
     def rms(self) -> dict[str, Floats]:
         """Rms (n,) [Nm] of each joint by side, pooled over the sessions by their number of samples; a side without a
@@ -64,6 +80,13 @@ class TorqueErrors(NamedTuple):
             side: np.array([np.sqrt(a / b) if b else np.nan for a, b in joints.values()])
             for side, joints in power.items()
         }
+
+
+def _table(score: SessionScore) -> Floats:
+    """Sums of squares (B, k) in blocks of the joints of all sides with an error."""
+    count = min((len(values) for values in score.squares.values()), default=0)
+    wide = np.hstack([np.zeros((count, 0)), *(values[:count] for values in score.squares.values())])
+    return wide[:, wide.sum(axis=0) > 0.0]
 
 
 def _mean_square(errors: Floats, base: Floats) -> float:

@@ -15,6 +15,7 @@ from ident.effects import PRESLIDING, SENSOR_GAIN, entry_of
 from ident.effects.motion import dahl
 from ident.rows.content import content
 from ident.rows.encoder_side import USUAL_TWIST_RAD
+from ident.rows.filters import SignalSettings
 
 Floats = NDArray[np.float64]
 
@@ -85,6 +86,13 @@ class NominalArm:
     def delays(self) -> dict[str, float]:
         """Delays of the channels [s], as in the signal settings of a model."""
         return {"motor_delay_s": self.motor_delay_s, "joint_delay_s": self.joint_delay_s}
+
+    def elastic(self, signals: SignalSettings) -> SignalSettings:
+        """Signal settings with the stiffness of the joints and the side of the positions; none for rigid joints."""
+        springs = None
+        if np.any(self.compliance > 0.0):
+            springs = tuple((1.0 / np.maximum(self.compliance, 1e-12)).tolist())
+        return replace(signals, stiffness_nm_rad=springs, encoder=self.encoder)
 
     def acts_as(self, other: NominalArm) -> bool:
         """Whether the rows of a session are the same with another arm."""

@@ -79,7 +79,7 @@ def confirmed(task: Task, state: State) -> tuple[list[Confirmed], list[Finding]]
             refuted.append(replace(finding, confidence=0.0))
             continue
         untested = _untested(claim) or hardly
-        grounds = _grounds(claim, claims, finding, bench, without, after, fallen, untested, seed)
+        grounds = _grounds(task, claim, claims, finding, bench, without, after, fallen, untested)
         plain = not at_odds[k] and _plain(claim, finding, bench, grounds, fallen)
         kept.append(Confirmed(claim, finding, replace(grounds, held=float(not plain))))
     return kept, refuted
@@ -166,7 +166,7 @@ def confirmed_delay(
     slow rows contradict the others, no row tells which is right, and the difference is part of the uncertainty.
     """
     assert after.baseline is not None
-    bench, selection, seed = after.bench, after.selection, task.settings.seed
+    bench, selection = after.bench, after.selection
     before = after.baseline.held
     now = held_out(bench.evidence, [*(c.trial.rows for c in selection.claims), *selection.nuisance_rows])
     finding = timing_finding(task, after, claim, rest, before, now)
@@ -179,7 +179,7 @@ def confirmed_delay(
         finding, parameters={"delay": delay}, evidence=replace(finding.evidence, p_value=p_value)
     )
     low, high = finding.evidence.gain_interval_95
-    grounds = _grounds(claim, selection.claims, finding, bench, before, now, (low, high), False, seed)
+    grounds = _grounds(task, claim, selection.claims, finding, bench, before, now, (low, high), False)
     grounds = replace(grounds, held=float(not _seen(low, grounds)))
     confidence = min(claim.confidence, probability(grounds))
     return replace(finding, confidence=confidence, grounds=grounds.to_dict())
@@ -238,6 +238,7 @@ def _seen(low: float, grounds: Grounds) -> bool:
 
 
 def _grounds(
+    task: Task,
     claim: Claim,
     claims: Sequence[Claim],
     finding: Finding,
@@ -246,7 +247,6 @@ def _grounds(
     after: HeldOut,
     fallen: tuple[float, float],
     untested: bool,
-    seed: int,
 ) -> Grounds:
     """The grounds from the rows fitted and, unless untested, held out. claims : of the selection."""
     effect, shown, (low, high) = claim.trial.candidate.effect, finding.evidence, fallen
@@ -255,6 +255,8 @@ def _grounds(
     # What the samples themselves show needs no significance by blocks.
     p_value = 0.0 if effect.seen_in_samples(claim.trial.shape) else shown.p_value
     acting = {key for key, columns in claim.trial.rows.items() if np.any(columns)}
+    usual = None if task.reference is None else task.reference.left
+    worse = not untested and bool(worse_rows(without, after, task.settings.seed, acting, usual))
     return Grounds(
         gain=math.log(max(claim.gain / least, 1e-3)),
         significance=-math.log10(max(p_value, 1e-300)),
@@ -263,7 +265,7 @@ def _grounds(
         untested=float(untested),
         felt=0.0 if untested else _share(finding),
         one_block=float(not untested and not spread_out(without, after, list(claim.trial.rows))),
-        worse=float(not untested and bool(worse_rows(without, after, seed, acting))),
+        worse=float(worse),
         habitual=float(effect.character),
         alone=float(not bench.dictionary.setting.compared),
         company=float(sum(other.gain > claim.gain for other in claims)),

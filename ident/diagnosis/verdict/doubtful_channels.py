@@ -25,7 +25,7 @@ from ident.effects import (
     SENSOR_SATURATION,
     ZERO_OFFSET,
 )
-from ident.screening.doubts import Doubt
+from ident.screening.doubts import Doubt, late_positions
 
 # Causes that are an error of the channel itself.
 _OWN: Mapping[str, tuple[str, ...]] = {
@@ -80,6 +80,8 @@ def held_back(found: Diagnosis, doubts: Sequence[Doubt], names: Sequence[str]) -
 
 def _bears(doubt: Doubt, finding: Finding, names: Sequence[str]) -> bool:
     """Whether a finding rests on the channel in doubt, and is no error of it."""
-    if finding.cause in (*_OWN[doubt.channel], *_COUNTED):
+    # Positions that are late by the torques are torques that are early.
+    of_time = _OWN["time"] if late_positions([doubt]) else ()
+    if finding.cause in (*_OWN[doubt.channel], *of_time, *_COUNTED):
         return False
     return not doubt.joints or not finding.joints or any(names[j - 1] in doubt.joints for j in finding.joints)

@@ -60,10 +60,14 @@ def fitted_models(
     named = [m.finding for m in members if m.finding is not None]
     effects = (*map(_entry, (*named, *state.timing)), *(e for term in nameless for e in term.entries))
     robot = task.sessions[0].metadata.get("robot", "") or "arm"
+    signals = task.settings.signals
+    if nominal.arm.encoder == "motor" and not signals.takes_links_back:
+        # The rows have the links on their springs; who computes the torque takes them back from the motors.
+        signals = nominal.arm.elastic(signals)
     provenance: dict[str, Any] = {
         "sessions": [r.name for r in nominal.recordings if not r.test],
         "estimator": "diagnosis",
-        SIGNALS: signals_entry(task.settings.signals) | nominal.arm.delays,
+        SIGNALS: signals_entry(signals) | nominal.arm.delays,
     }
     structure = replace(nominal.structure, coulomb=task.settings.law or nominal.structure.coulomb)
     base = DynamicModel(

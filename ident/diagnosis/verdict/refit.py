@@ -20,7 +20,7 @@ from ident.diagnosis.gain.products import Floats
 from ident.diagnosis.rows.nominal import Nominal
 from ident.diagnosis.rows.recording import RecordStretch
 from ident.diagnosis.verdict.task import Task
-from ident.dynamics.structure import Side
+from ident.dynamics.structure import DriveMotion, Side
 from ident.effects import BASE_TILT, SENSOR_GAIN, Column, effects_torque
 from ident.effects.motion import ArmMotion
 from ident.estimation.automatic import choose
@@ -128,7 +128,12 @@ def left_by(model: DynamicModel, nominal: Nominal, held: HeldOut) -> HeldOut:
 
         def made(motion: ArmMotion) -> tuple[Column, ...]:
             torque = model.linear_torque(
-                motion.q, motion.qd, motion.qdd, payload=payloads[motion.session], side=side
+                motion.q,
+                motion.qd,
+                motion.qdd,
+                payload=payloads[motion.session],
+                side=side,
+                drive=DriveMotion(motion.motor_speed, motion.motor_acceleration),
             ) + effects_torque(model.effects, motion, side=side, measured=True)
             return (Column(motor=torque) if side == "motor" else Column(joint=torque),)
 

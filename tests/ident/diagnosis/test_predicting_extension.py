@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -171,3 +173,17 @@ def test_where_no_extension_predicts_better_nothing_says_that_there_is_one(
     # The name of a fault is contradicted; what every such drive has is only not in the model.
     assert doubted == [("cable_spring", True)]
     assert [(f.cause, f.confidence <= 0.7) for f in told.character] == [("friction_asymmetry", True)]
+
+
+@pytest.mark.parametrize(("spread", "harm"), [(0.2, False), (0.002, True)])
+def test_a_rise_within_its_interval_is_no_harm(spread: float, harm: bool) -> None:
+    rng = np.random.default_rng(3)
+    squares = 1.0 + rng.uniform(0.0, 0.5, (60, 2))
+    change = rng.normal(1.004, spread, squares.shape)
+    change *= 1.004 / (np.sum(squares * change) / np.sum(squares))
+
+    def errors(power: Any) -> TorqueErrors:
+        rms = np.sqrt(power.sum(axis=0))
+        return TorqueErrors(np.ones(1), rms, rms, (SimpleNamespace(squares={"joint": power}),))  # type: ignore[arg-type]
+
+    assert (errors(squares * change).left_of(errors(squares)) > 1.0) == harm

@@ -6,7 +6,7 @@ import yaml
 
 from fri.errors import ConfigurationError
 from ident.dynamics.base_set import numeric_base
-from ident.dynamics.structure import Condition, Coupling, ModelStructure
+from ident.dynamics.structure import Condition, Coupling, DriveMotion, ModelStructure
 from ident.model.dynamic_model import DynamicModel
 from ident.model.model_file import model_text, read_model, write_model
 from tests.ident.dynamics.core_arms import bodies, lwr, scara, states, tx40
@@ -207,3 +207,14 @@ def test_values_and_names_must_fit():
         DynamicModel("arm", structure, ("M1", "M1"), [1.0, 2.0])
     with pytest.raises(ConfigurationError, match="another structure"):
         DynamicModel("arm", structure, (), [], base=numeric_base(STRUCTURES["scara"]()))
+
+
+def test_drives_behind_elastic_joints_move_by_themselves():
+    model = base_model()
+    q, qd, qdd = states(model.structure.chain, 15)
+    moved = DriveMotion(qd[::-1].copy(), qdd[::-1].copy())
+    for side in model.structure.sides:
+        matrix = model.structure.regressor(q, qd, qdd, sides=(side,), columns=model.columns, drive=moved)
+        torque = model.torque(q, qd, qdd, side=side, drive=moved)
+        assert torque == pytest.approx((matrix @ model.values).reshape(-1, 15).T, abs=1e-10)
+        assert np.allclose(torque, model.torque(q, qd, qdd, side=side)) == (side == "joint")

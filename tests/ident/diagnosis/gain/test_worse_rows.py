@@ -34,3 +34,12 @@ def test_a_row_without_the_cause_has_to_be_much_worse_beyond_chance(
     assert bool(worse_rows(before, after, 1)) == anywhere
     assert bool(worse_rows(before, after, 1, {("motor", 1)})) == anywhere
     assert bool(worse_rows(before, after, 1, {("motor", 0)})) == elsewhere
+
+
+def test_a_row_without_the_cause_may_be_as_wrong_as_on_a_healthy_day() -> None:
+    before, after, elsewhere = errors(1.0), errors(1.08), {("motor", 0)}
+    level = after.rms()["motor"]
+    assert worse_rows(before, after, 1, elsewhere, {"motor": 0.99 * level}) == [("motor", 1)]
+    assert worse_rows(before, after, 1, elsewhere, {"motor": 1.01 * level}) == []
+    assert worse_rows(before, after, 1, {("motor", 1)}, {"motor": 1.01 * level}) == [("motor", 1)]
+    assert worse_rows(before, after, 1, elsewhere, {"joint": level}) == [("motor", 1)]

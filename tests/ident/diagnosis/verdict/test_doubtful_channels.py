@@ -12,7 +12,7 @@ from ident.diagnosis.rows.broken_data import BrokenChannel
 from ident.diagnosis.verdict.confidence import OPEN
 from ident.diagnosis.verdict.doubtful_channels import bending, held_back, unconfirmed, without_payloads
 from ident.diagnosis.verdict.task import Task
-from ident.screening.doubts import Doubt
+from ident.screening.doubts import MEND_TIME, Doubt
 
 NAMES = ("one", "two", "three")
 GAIN = Doubt("motor torque", ("two",), "is 1.8 times the others", "a gain of 1.8", "check", kind="gain")
@@ -57,6 +57,13 @@ def test_no_claim_from_a_channel_in_doubt_is_sure(finding: Finding, sure: bool) 
     assert told.notes[0] == "first"
     assert told.notes[1].startswith(f"{GAIN}. The channel stays")
     assert told.notes[2] == str(CLIPPED)
+
+
+def test_late_positions_say_the_same_as_early_torques() -> None:
+    late = Doubt("position", ("two",), "contradicts the torques", "positions -16 ms late", MEND_TIME)
+    delay, tilt = claim("joint_torque_delay"), claim("base_tilt")
+    told: Any = held_back(Told((delay, tilt), ()), [late], NAMES)  # type: ignore[arg-type]
+    assert [one.confidence for one in told.findings] == [0.95, OPEN]
 
 
 def test_samples_at_a_limit_bend_nothing_for_they_are_left_out() -> None:
