@@ -112,18 +112,22 @@ class Store:
 
     def sessions(self, case: Case) -> Sessions:
         """The logs of a case, recorded now where they are missing."""
-        paths = []
-        for number, setting in enumerate(case.settings()):
-            path = self.folder / case.name / f"session_{number + 1}.mcap"
-            if not path.is_file():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                # Processes that need the same day at once record it each.
-                part = path.with_suffix(f".{os.getpid()}.part.mcap")
-                part.unlink(missing_ok=True)
-                record(order(case, number, setting, part))
-                part.replace(path)
-            paths.append(path)
-        return Sessions(tuple(paths[:-1]), tuple(paths[-1:]))
+        return Sessions(self.train(case), (self._log(case, SESSIONS - 1),))
+
+    def train(self, case: Case) -> tuple[Path, ...]:
+        """Those of a case to learn from."""
+        return tuple(self._log(case, number) for number in range(SESSIONS - 1))
+
+    def _log(self, case: Case, number: int) -> Path:
+        path = self.folder / case.name / f"session_{number + 1}.mcap"
+        if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Processes that need the same day at once record it each.
+            part = path.with_suffix(f".{os.getpid()}.part.mcap")
+            part.unlink(missing_ok=True)
+            record(order(case, number, case.settings()[number], part))
+            part.replace(path)
+        return path
 
     def error(self, case: Case) -> NDArray[np.float64]:
         """Held-out error of the base model (14,) [Nm], kept beside the logs of healthy twins."""

@@ -59,8 +59,7 @@ def commissioned(
     chain, data = _arm()
     sets = []
     for case in healthy_sets(encoder, days, schedules, store.era):
-        sessions = store.sessions(case)
-        sets.append([read_session(session) for session in sessions.train])
+        sets.append([read_session(path) for path in store.train(case)])
     reference = commission(sets, chain, arm=data)
     model = reference.model
     model = dataclasses.replace(model, provenance={**model.provenance, **reference.stored()})

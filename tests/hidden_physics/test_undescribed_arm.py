@@ -21,11 +21,13 @@ _DAY = 0.03
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("encoder", ["motor", "link"])
-def test_the_side_of_the_encoders_and_the_stiffness_are_found(encoder: Encoder, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("encoder", "days"), [("motor", 2), ("link", 1)])
+def test_the_side_of_the_encoders_and_the_stiffness_are_found(
+    encoder: Encoder, days: int, tmp_path: Path
+) -> None:
     arm, store = Arm.load(), Store(tmp_path)
     chain = Chain.from_urdf(arm.urdf)
-    sets = [[read_session(path) for path in store.sessions(case).train] for case in healthy_sets(encoder, 2)]
+    sets = [[read_session(path) for path in store.train(case)] for case in healthy_sets(encoder, days)]
     found = commission(sets, chain, arm=ArmData(gear_ratio=arm.gear_ratio))
     assert found.encoder == encoder
     truth, told = 1.0 / np.array(RobotConfig().stiffness), found.compliance > 0.0
