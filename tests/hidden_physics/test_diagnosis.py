@@ -9,9 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from runner.cli import main
-from tests.hidden_physics.cases import Case, Store, draw
+from tests.hidden_physics.cases import Case, Store, draw, twin
 from tests.hidden_physics.engine import REFERENCE, diagnosed
 from tests.hidden_physics.verdict import judge
+
+_PAIR = ("friction_asymmetry", "cable_spring")
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,9 @@ def by_command(store: Store, case: Case) -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_nothing_hidden_nothing_claimed_on_the_command_line(store: Store) -> None:
-    case = draw(1, "none", store)
+    # Of the day of a pair below, which is recorded beside it.
+    pair = draw(2, "pair", store, causes=_PAIR, size=1.5)
+    case = twin(pair.schedule, pair.day)
     verdict = judge(by_command(store, case), case.hidden)
     assert verdict.silent, verdict.findings
 
@@ -41,7 +45,7 @@ def test_nothing_hidden_nothing_claimed_on_the_command_line(store: Store) -> Non
 @pytest.mark.parametrize(
     ("causes", "seed", "size"),
     [
-        (("friction_asymmetry", "cable_spring"), 2, 1.5),
+        (_PAIR, 2, 1.5),
         pytest.param(("sensor_hysteresis", "motor_torque_delay"), 3, 3.0, marks=pytest.mark.long),
         pytest.param(("payload_change", "stribeck"), 4, 2.5, marks=pytest.mark.long),
     ],
