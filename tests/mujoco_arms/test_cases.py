@@ -49,12 +49,17 @@ def test_days_differ_and_the_arm_does_not() -> None:
         assert (np.abs(np.log(change)) < 2.0 * most + 0.03).all()
 
 
+@pytest.fixture(scope="module")
+def stribeck() -> Bench:
+    """The bench of a case with a hidden cause."""
+    return Bench(shortened(draw(2, "single", "stribeck", "lwr4plus"), 15.0))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("target", [1.15, 2.0])
-def test_strength_makes_the_wanted_visibility(target: float) -> None:
-    case = shortened(draw(2, "single", "stribeck", "lwr4plus"), 15.0)
-    case = replace(case, hidden=(replace(case.hidden[0], target=target),))
-    found = sized(case, Bench(case), np.random.default_rng(1)).hidden[0]
+def test_strength_makes_the_wanted_visibility(stribeck: Bench, target: float) -> None:
+    case = replace(stribeck.case, hidden=(replace(stribeck.case.hidden[0], target=target),))
+    found = sized(case, stribeck, np.random.default_rng(1)).hidden[0]
     assert found.rho == pytest.approx(target, rel=0.1)
 
 
