@@ -107,6 +107,7 @@ def offers(
     At most three. A motion without any acceptable size is left out, with a line in the log.
     """
     found: dict[str, Discriminating] = {}
+    refused: list[tuple[str, tuple[Payload | None, ...]]] = []
     for finding in open_findings(diagnosis, experiment.diagnosis.sure):
         rivals = ((finding.cause, finding.joints), *((c, j) for c, j, _ in finding.alternatives))
         for cause, joints in rivals:
@@ -123,8 +124,12 @@ def offers(
                 found[name] = replace(known, rivals=tuple(dict.fromkeys((*known.rivals, *rivals))))
                 continue
             loads = _payloads(experiment, [c for c, _ in rivals])
+            if (name, loads) in refused:
+                continue
             plan = _plan(kind, joint, experiment, arm, cell, exciting, loads)
-            if plan is not None:
+            if plan is None:
+                refused.append((name, loads))
+            else:
                 found[name] = Discriminating(name, kind, joint, plan, loads, rivals)
     return tuple(found.values())
 

@@ -131,12 +131,17 @@ def test_one_motion_serves_several_questions(experiment: Experiment, arm: Arm) -
 
 
 @pytest.mark.slow
-def test_where_nothing_passes_nothing_is_offered(experiment: Experiment, arm: Arm) -> None:
+def test_where_nothing_passes_nothing_is_offered(
+    experiment: Experiment, arm: Arm, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
     weak = replace(arm, tau_max=np.full(7, 1.0))
     cell = Cell.load(experiment.cell)
     plan = plan_excitation(experiment, arm, cell)
     found = diagnosis(finding("stribeck", 2, 0.6, ("viscous_nonlinear", (2,))))
     assert offers(found, experiment, weak, cell, plan) == ()
+    # Both causes ask for this one.
+    assert caplog.messages.count("no slow sweep passes every check") == 1
 
 
 NAMES = ("A1", "A2", "E1", "A3", "A4", "A5", "A6")
