@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -197,6 +197,10 @@ def true_base(identification: object) -> Array:
 
 
 STIFFNESS = (1e4,) * 7
+
+
+at_125_hz = partial(session, rate_hz=125.0)
+"""A session of half as many samples, where their number does not matter."""
 
 
 def at_the_motors(one: Session) -> Session:

@@ -129,7 +129,7 @@ def test_model_3_and_a_chain_without_gravity_are_refused() -> None:
 
 def test_the_columns_of_a_tilt_are_the_torques_of_a_turned_gravity_on_both_sides_and_of_the_payload() -> None:
     arm = estimation_arm.chain()
-    sessions = [estimation_arm.session(), estimation_arm.session(loaded=True)]
+    sessions = [estimation_arm.at_125_hz(), estimation_arm.at_125_hz(loaded=True)]
     settings = IdentificationSettings(essential=None, signals=SignalSettings(10.0, decimate_hz=2.0))
     found = identify(sessions, arm, settings)
     columns = tilt_columns(found, sessions)

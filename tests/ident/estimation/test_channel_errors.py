@@ -15,14 +15,14 @@ from ident.estimation.identification import Identification, IdentificationSettin
 from ident.estimation.identify import identify
 from ident.estimators import CovarianceSettings
 from lwr_driver.session import Session
-from tests.ident.estimation_arm import Sensors, chain, session, true_base
+from tests.ident.estimation_arm import Sensors, at_125_hz, chain, true_base
 
 NOISE = Sensors(joint=0.2, motor=0.3)
 
 
 @lru_cache
 def recorded() -> tuple[Session, ...]:
-    return tuple(session(loaded=loaded, seed=3 + loaded, sensors=NOISE) for loaded in (False, True))
+    return tuple(at_125_hz(loaded=loaded, seed=3 + loaded, sensors=NOISE) for loaded in (False, True))
 
 
 def with_channels(gain: float, crosstalk: float, seed: int) -> list[Session]:
@@ -81,6 +81,6 @@ def test_rows_of_the_difference_of_two_channels_tell_none() -> None:
 
 
 def test_data_without_noise_give_finite_deviations() -> None:
-    found = identified([session(loaded=loaded) for loaded in (False, True)])
+    found = identified([at_125_hz(loaded=loaded) for loaded in (False, True)])
     assert np.all(np.isfinite(found.estimate.std))
     assert np.all(np.linalg.eigvalsh(found.estimate.covariance.matrix) > -1e-12)

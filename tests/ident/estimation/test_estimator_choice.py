@@ -19,7 +19,7 @@ from ident.estimation.parts import PARTS, beside, held_back_parts
 from ident.estimators import MaximumAPosteriori, Prior, Problem, RowGroup, WeightedLeastSquares
 from ident.estimators.physical import lacking_bodies
 from ident.estimators.prior import Disagreement
-from tests.ident.estimation_arm import Sensors, chain, session, true_base
+from tests.ident.estimation_arm import Sensors, at_125_hz, chain, true_base
 from tests.ident.regression_problems import design, problem
 
 SENSORS = Sensors(position=1e-5, joint=0.2, correlation_s=0.3)
@@ -36,7 +36,7 @@ def chosen(periods: int = 3, kilogrammes: float | None = None) -> Identification
     if kilogrammes is not None:
         text = re.sub(r'<mass value="[^"]*"', f'<mass value="{kilogrammes}"', text)
         text = re.sub(r'<origin xyz="[^"]*"(?=[^<]*/>\s*<mass)', '<origin xyz="0 0 0"', text)
-    logs = [session(sensors=SENSORS, motor=False, periods=periods)]
+    logs = [at_125_hz(sensors=SENSORS, motor=False, periods=periods)]
     return identify(logs, Chain.from_urdf(text), MODEL_1, known=SCREENED if kilogrammes else None)
 
 
@@ -106,7 +106,7 @@ def test_what_predicts_no_better_than_zero_is_no_choice(
 
     monkeypatch.setattr(EstimatorComparison, "_errors", errors)
     found = choose(
-        [session(sensors=SENSORS, motor=False, periods=3)], chain(), MODEL_1, tilt=False, known=SCREENED
+        [at_125_hz(sensors=SENSORS, motor=False, periods=3)], chain(), MODEL_1, tilt=False, known=SCREENED
     )
     assert found.choice is not None
     assert found.choice.winner.estimator == winner
@@ -115,7 +115,7 @@ def test_what_predicts_no_better_than_zero_is_no_choice(
 
 
 def test_a_tilt_is_found_where_it_helps():
-    log = session(sensors=SENSORS, motor=False, periods=3)
+    log = at_125_hz(sensors=SENSORS, motor=False, periods=3)
     turn = np.deg2rad(2.0)
     turned = Chain.from_urdf(chain().urdf, gravity=(0.0, 9.81 * np.sin(turn), -9.81 * np.cos(turn)))
     found = choose([log], turned, MODEL_1, known=SCREENED)
@@ -132,7 +132,7 @@ def test_an_earlier_choice_is_taken_for_other_sessions_and_estimates_anew(monkey
     first = chosen(kilogrammes=4.0).choice
     assert first is not None
     monkeypatch.setattr("ident.estimation.automatic.compared", None)
-    other = session(sensors=SENSORS, motor=False, seed=7)
+    other = at_125_hz(sensors=SENSORS, motor=False, seed=7)
     again = choose([other], chain(), MODEL_1, known=SCREENED, like=first)
     assert again.choice is not None
     assert again.choice.winner == first.winner
@@ -141,7 +141,7 @@ def test_an_earlier_choice_is_taken_for_other_sessions_and_estimates_anew(monkey
 
 
 def test_a_sensor_that_reads_too_much_is_found_and_stated_as_an_effect():
-    log = session(sensors=SENSORS, motor=False, periods=3)
+    log = at_125_hz(sensors=SENSORS, motor=False, periods=3)
     effort = log.joint.effort.copy()
     effort[:, 1] *= 1.08
     changed = replace(log, joint=replace(log.joint, effort=effort))
@@ -166,7 +166,7 @@ def test_a_sensor_that_reads_too_much_is_found_and_stated_as_an_effect():
 
 def test_an_error_common_to_most_sensors_is_one_of_the_bodies():
     """Beside a sensor that reads far too little the others' errors have a common part of two per cent."""
-    log = session(sensors=SENSORS, motor=False, periods=3)
+    log = at_125_hz(sensors=SENSORS, motor=False, periods=3)
     effort = log.joint.effort.copy()
     effort[:, 3] *= 0.84
     changed = replace(log, joint=replace(log.joint, effort=effort))
@@ -177,7 +177,7 @@ def test_an_error_common_to_most_sensors_is_one_of_the_bodies():
 
 
 def test_a_sensor_dead_in_one_session_leaves_the_choice_to_the_others():
-    first, second = (session(sensors=SENSORS, seed=seed, motor=False) for seed in (1, 2))
+    first, second = (at_125_hz(sensors=SENSORS, seed=seed, motor=False) for seed in (1, 2))
     effort = second.joint.effort.copy()
     effort[:, 3] = 0.0
     found = identify([first, replace(second, joint=replace(second.joint, effort=effort))], chain(), MODEL_1)
@@ -186,7 +186,7 @@ def test_a_sensor_dead_in_one_session_leaves_the_choice_to_the_others():
 
 
 def test_a_joint_that_a_gain_explains_weighs_by_what_is_left():
-    log = session(sensors=replace(SENSORS, joint=0.02), motor=False, periods=3)
+    log = at_125_hz(sensors=replace(SENSORS, joint=0.02), motor=False, periods=3)
     effort = log.joint.effort.copy()
     effort[:, 3] *= 1.08
     changed = replace(log, joint=replace(log.joint, effort=effort))
@@ -229,7 +229,7 @@ def test_a_urdf_without_bodies_leaves_least_squares_and_the_reason():
     text = chain().urdf
     assert isinstance(text, str)
     bare = Chain.from_urdf(re.sub(r"<inertial>.*?</inertial>", "", text, flags=re.DOTALL))
-    log = session(sensors=SENSORS, motor=False)
+    log = at_125_hz(sensors=SENSORS, motor=False)
     found = identify([log], bare, MODEL_1, known=SCREENED)
     assert found.choice is not None
     assert {candidate.estimator for candidate in found.choice.candidates} == {"wls"}
@@ -254,7 +254,7 @@ def test_a_link_without_mass_is_named_and_leaves_no_prior():
 
 
 def test_a_weak_motion_is_identified_with_the_prior_and_names_what_it_does_not_show():
-    log = session(sensors=SENSORS, motor=False, still=(0, 2, 3))
+    log = at_125_hz(sensors=SENSORS, motor=False, still=(0, 2, 3))
     arm = chain()
     with pytest.raises(DataError, match=r"--without.*--estimator physical"):
         WeightedLeastSquares().fit(_weak())
@@ -309,7 +309,7 @@ def test_the_distance_from_a_right_prior_is_chi_square():
 
 
 def test_least_squares_stays_one_word_away():
-    log = session(sensors=SENSORS, motor=False)
+    log = at_125_hz(sensors=SENSORS, motor=False)
     settings = IdentificationSettings(model=1, essential=None)
     found = identify([log], chain(), settings, known=SCREENED)
     assert found.choice is None
@@ -332,7 +332,7 @@ def test_a_leaning_base_has_to_pay_against_the_same_estimator_upright(
     monkeypatch.setattr(EstimatorComparison, "_errors", errors)
     monkeypatch.setattr(EstimatorComparison, "_leans", lambda *_: True)
     monkeypatch.setattr(EstimatorComparison, "_wider", lambda *_: iter(()))
-    found = choose([session(sensors=SENSORS, motor=False, periods=3)], chain(), MODEL_1, known=SCREENED)
+    found = choose([at_125_hz(sensors=SENSORS, motor=False, periods=3)], chain(), MODEL_1, known=SCREENED)
     assert found.choice is not None
     assert (found.choice.winner.estimator, found.choice.winner.tilt) == ("physical", False)
     assert "the lower error of wls is no proof" in str(found.choice)

@@ -33,7 +33,7 @@ SCREENED = Known()
 @lru_cache
 def sessions(**changes):
     return tuple(
-        arm.session(loaded=loaded, seed=int(loaded), sensors=NOISY, **changes) for loaded in (False, True)
+        arm.at_125_hz(loaded=loaded, seed=int(loaded), sensors=NOISY, **changes) for loaded in (False, True)
     )
 
 
@@ -118,7 +118,7 @@ def test_stated_intervals_cover_over_many_sessions():
     for seed in range(12):
         sensors = arm.Sensors(joint=0.2, correlation_s=0.5)
         recorded = [
-            arm.session(
+            arm.at_125_hz(
                 loaded=loaded,
                 seed=100 * seed + loaded,
                 sensors=sensors,
@@ -210,7 +210,7 @@ def test_joint_names_of_another_arm_are_refused():
 
 
 def test_a_joint_that_never_moves_is_named():
-    still = [arm.session(loaded=loaded, still=(4,), motor=False) for loaded in (False, True)]
+    still = [arm.at_125_hz(loaded=loaded, still=(4,), motor=False) for loaded in (False, True)]
     with pytest.raises(DataError, match="joint A4 never moves"):
         identify(still, arm.chain(), IdentificationSettings(model=1))
 
@@ -235,7 +235,7 @@ def named(session, payload, mass=""):
 @pytest.mark.parametrize("mass", ["", "3.28"])
 def test_a_payload_that_was_announced_but_not_mounted_is_refused(mass):
     bare = sessions()[0]
-    claimed = named(arm.session(seed=9, sensors=NOISY), "payload", mass)
+    claimed = named(arm.at_125_hz(seed=9, sensors=NOISY), "payload", mass)
     # The screening leaves it to the mass; once is enough to see that.
     known = SCREENED if mass else None
     with pytest.raises(DataError, match=r"not mounted in unloaded.mcap, or it was mounted in .*`--payload"):
@@ -254,7 +254,7 @@ def test_a_payload_that_hung_in_the_session_of_the_bare_arm_is_refused(mass):
             IdentificationSettings(essential=None),
             known=known,
         )
-    both = [named(loaded, "none"), named(arm.session(seed=9, sensors=NOISY, loaded=True), "payload", mass)]
+    both = [named(loaded, "none"), named(arm.at_125_hz(seed=9, sensors=NOISY, loaded=True), "payload", mass)]
     with pytest.raises(DataError, match=r"mounted in loaded.mcap as well"):
         identify(both, arm.chain(), IdentificationSettings(essential=None), known=known)
 
