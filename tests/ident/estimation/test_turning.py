@@ -45,6 +45,7 @@ def told(
     one: TorqueChannel, monkeypatch: pytest.MonkeyPatch, prismatic: tuple[bool, bool] = (False, False)
 ) -> turning.Turning | None:
     model: Any = SimpleNamespace(
+        effects=(),
         structure=SimpleNamespace(
             sides=("motor", "joint"),
             coulomb=Coulomb(),
