@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import pairwise, product
 
 import numpy as np
@@ -261,7 +260,7 @@ class Dictionary:
         return found
 
     def _entry(self, shape: Shape, rows: Rows) -> _Entry:
-        products = self.evidence.alone(self.evidence.ordered(rows))
+        products = self.evidence.products.alone(rows)
         # All candidates together exceed the memory.
         kept = {key: self._arena.keep(values) for key, values in rows.items()}
         return shape, kept, replace(products, alone=self._arena.keep(products.alone))
@@ -299,8 +298,8 @@ class Dictionary:
             if entry is None:
                 continue
             _, rows, known = entry
-            whole = evidence.products(partial(evidence.ordered, rows), known)
-            base = evidence.in_blocks(whole)
+            whole = evidence.products.beside(rows, known)
+            base = evidence.products.in_blocks(whole)
             lasting = np.unique([m.session for m in self.nominal.motions if effect.lasts(form, m)])
             fall = evidence.setting_in(whole, base, lasting)
             for session in np.unique(evidence.block_session).tolist():
@@ -365,7 +364,7 @@ class Dictionary:
             both = {} if entry is None else {**entry[1]}
             for key, columns in trial.rows.items():
                 both[key] = columns + both[key] if key in both else columns
-            if self.evidence.score(self.evidence.ordered(both)).fitted > trial.score.fitted + _TIED:
+            if self.evidence.score(both).fitted > trial.score.fitted + _TIED:
                 return True
         return False
 
@@ -446,7 +445,7 @@ class Dictionary:
     def measure(self, candidate: Candidate, rows: Rows, known: Products | None = None) -> Score:
         """Score of rows by the rules of the candidate's effect; `known` : their products with the base alone."""
         if known is None:
-            return self.evidence.score(self.evidence.ordered(rows), pull=_pull(candidate))
+            return self.evidence.score(rows, pull=_pull(candidate))
         return self.evidence.score_groups([(rows, known)], pull=_pull(candidate))[0]
 
     def _measured(self, candidate: Candidate) -> Iterator[tuple[Shape, Rows, Score]]:

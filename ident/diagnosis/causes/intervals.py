@@ -94,7 +94,7 @@ def _with_derivatives(dictionary: Dictionary, trial: Trial) -> tuple[Sequence[st
 
 def _clustered(evidence: Evidence) -> Floats:
     """Covariance (P, P) of all present columns from phases, at least that of independent rows."""
-    gram, target = evidence.sums(phases_of(evidence))
+    gram, target = evidence.products.sums(phases_of(evidence))
     scores = target - gram @ evidence.full.values
     inverse = evidence.full.inverse
     size = np.sqrt(np.maximum(np.diag(inverse), 1e-300))

@@ -235,7 +235,7 @@ def find_remainders(
     for one in _searched(dictionary, variables):
         arena, prepared = Arena(), dict[str, tuple[Rows, Products]]()
         for name, rows in one.groups.items():
-            known = evidence.alone(evidence.ordered(rows))
+            known = evidence.products.alone(rows)
             prepared[name] = rows, replace(known, alone=arena.keep(known.alone))
         limits = {
             name: max(settings.least_gain, _limit(null or {}, one.side, one.joint, name))
@@ -265,7 +265,7 @@ def _one(
     fixed, line_hz, beside_line = list(evidence.extra), 0.0, 0.0
     if line is not None:
         frequency, waves, choices = line
-        score = evidence.score(evidence.ordered(waves))
+        score = evidence.score(waves)
         least = limits[_ANY] + 2.0 * (len(score.coefficients) + np.log(choices))
         if score.gain > least and score.inflation > _LEAST_INFLATION:
             line_hz = frequency
@@ -306,8 +306,8 @@ def remainder_gains(dictionary: Dictionary) -> dict[tuple[str, int], float]:
     found = {}
     evidence = dictionary.evidence
     for one in _searched(dictionary, hats_of(dictionary)):
-        scores = [evidence.score(evidence.ordered(rows), ridge=_RIDGE) for rows in one.groups.values()]
-        scores += [] if one.line is None else [evidence.score(evidence.ordered(one.line[1]))]
+        scores = [evidence.score(rows, ridge=_RIDGE) for rows in one.groups.values()]
+        scores += [] if one.line is None else [evidence.score(one.line[1])]
         found[NAMELESS[one.side].cause, one.joint] = max(0.0, *(score.gain for score in scores))
         for name, score in zip(one.groups, scores, strict=False):
             kind = _kind(one.side, one.joint, name)

@@ -173,8 +173,9 @@ def _joint_delays(dictionary: Dictionary, evidence: Evidence, rows: Rows, limit:
     """
     keys, known = sorted(rows), dictionary.nominal.arm.encoder_known
     weight = {
-        key: float(np.sum(part**2)) / float(evidence.sigma[key[0]][key[1]] ** 2)
-        for key, part in evidence.padded(rows).items()
+        key: float(np.sum((part * evidence.mask[key][:, None]) ** 2))
+        / float(evidence.sigma[key[0]][key[1]] ** 2)
+        for key, part in evidence.products.ordered(rows).items()
     }
     best = max(keys, key=lambda key: weight[key])
     common = (_KNOWN_DELAY if known else 2.0) * limit
@@ -199,7 +200,7 @@ def _sizes(dictionary: Dictionary, evidence: Evidence, least_gain: float) -> lis
         if not rows:
             continue
         size = HABITUAL * _FURTHER * _usual_share(entry, effect)
-        if evidence.information(evidence.alone(evidence.ordered(rows))) * size**2 > least_gain:
+        if evidence.information(evidence.products.alone(rows)) * size**2 > least_gain:
             found.append(Tolerance(Kind.SIZE, number, rows, size, candidate.key))
     return found
 

@@ -263,7 +263,7 @@ def _compliance_step(nominal: Nominal, evidence: Evidence, arm: NominalArm) -> t
     dictionary = Dictionary(nominal, evidence, [ELASTICITY.cause])
     for candidate in dictionary.candidates:
         rows = dictionary.rows(candidate, ELASTICITY.at_encoder("link"))
-        score = evidence.score(evidence.ordered(rows))
+        score = evidence.score(rows)
         j = candidate.joint
         value, std = float(score.coefficients[0]), float(np.sqrt(score.covariance[0, 0]))
         known[j] = std
@@ -336,7 +336,7 @@ def slow_delay(bench: DiagnosisBench, trial: Trial) -> tuple[float, float]:
     evidence, _ = _evidence(slow, settings, None)
     dictionary = Dictionary(slow, evidence, [trial.candidate.cause])
     rows = dictionary.rows(trial.candidate, trial.shape)
-    score = evidence.score(evidence.ordered(rows))
+    score = evidence.score(rows)
     delay = float(trial.shape["delay"])
     return delay * float(score.coefficients[0]), abs(delay) * float(np.sqrt(score.covariance[0, 0]))
 

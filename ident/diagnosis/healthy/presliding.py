@@ -103,7 +103,7 @@ def slow_turns(nominal: Nominal, evidence: Evidence) -> SlowTurns:
                 state = dahl(path, longer * float(lengths[joint]), float(np.sign(m.motor_speed[0, joint])))
                 signals.append(state - m.direction[:, joint])
             rows = {("motor", int(joint)): nominal.grid.reduce("motor", signals)[:, None]}
-            score = evidence.score(evidence.ordered(rows))
+            score = evidence.score(rows)
             if np.isfinite(score.gain):
                 found[:, k, joint] = score.coefficients[0], np.sqrt(score.covariance[0, 0])
     return found

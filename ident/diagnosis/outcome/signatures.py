@@ -142,7 +142,7 @@ def _signature(
     # A form may use fewer coefficients than its effect.
     coefficients = coefficients[: next(iter(rows.values())).shape[1]]
     evidence = bench.evidence
-    cross = evidence.products(evidence.ordered(rows)).sums[0].sum(axis=0)
+    cross = evidence.products.beside(rows).sums[0].sum(axis=0)
     projection = evidence.full.inverse @ cross.T
     torque, left = _torques(bench, rows, projection, coefficients)
     whole = _weighted(bench, rows, None)
@@ -175,7 +175,7 @@ def _fitted(bench: DiagnosisBench, candidate: Candidate) -> Trial:
     for shape in candidate.effect.shapes(dictionary.setting, max(candidate.joint, 0)):
         rows = dictionary.rows(candidate, shape)
         if any(np.any(part) for part in rows.values()):
-            score = bench.evidence.score(bench.evidence.ordered(rows))
+            score = bench.evidence.score(rows)
             found.append(Trial(candidate, shape, score, rows))
     if not found:
         raise DataError(f"{candidate.cause} leaves no torque in these sessions, so it has no signature")

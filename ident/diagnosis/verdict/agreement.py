@@ -32,7 +32,7 @@ def on_both_sides(dictionary: Dictionary, claim: Claim) -> bool:
     torque = _torque(claim, dictionary.turned(trial.candidate, trial.shape))
     if not any(np.any(column) for column in torque.values()):
         return False
-    score = dictionary.evidence.score(dictionary.evidence.ordered(torque))
+    score = dictionary.evidence.score(torque)
     if not np.isfinite(score.gain):
         return False
     size, std = float(score.coefficients[0]), float(np.sqrt(score.covariance[0, 0]))
@@ -51,7 +51,7 @@ def uneven(dictionary: Dictionary, claim: Claim) -> bool:
     columns = {key: np.zeros((len(torque[key]), own)) for key in shown[:-1]}
     for k, key in enumerate(shown[:-1]):
         columns[key][:, k] = torque[key][:, 0]
-    score = dictionary.evidence.score(dictionary.evidence.ordered(columns))
+    score = dictionary.evidence.score(columns)
     if not np.isfinite(score.gain) or score.p_value >= dictionary.evidence.settings.alpha_rare:
         return False
     share = np.array([power[key] for key in shown]) / sum(power[key] for key in shown)
@@ -67,7 +67,7 @@ def in_one_joint(dictionary: Dictionary, claim: Claim) -> bool:
     power = powers(claim.trial, dictionary)
     _, main = max(power, key=lambda key: power[key])
     torque = {key: column for key, column in _torque(claim, claim.trial.rows).items() if key[1] == main}
-    score = dictionary.evidence.score(dictionary.evidence.ordered(torque))
+    score = dictionary.evidence.score(torque)
     return not np.isfinite(score.gain) or float(score.covariance[0, 0]) > _KNOWN**2
 
 

@@ -145,7 +145,7 @@ def _rest(bench: DiagnosisBench, selection: Selection, cause: str) -> tuple[floa
     tolerated = [one.tolerance.rows for one in selection.deviations if one.tolerance.cause != cause]
     bench.evidence.replace([*taken, *tolerated])
     columns = bench.dictionary.rows(Candidate(EFFECTS[cause], -1), Shape(delay=_UNIT_S))
-    return _delay_of(bench.evidence.score(bench.evidence.ordered(columns)))
+    return _delay_of(bench.evidence.score(columns))
 
 
 def _delay_of(score: Score) -> tuple[float, float]:
@@ -226,11 +226,11 @@ def _late_in_all_joints(bench: DiagnosisBench, claim: Claim) -> bool:
     """Whether the other joints confirm the delay of the joint with most of the evidence, unlike drag in one joint."""
     evidence = bench.evidence
     evidence.replace([])
-    ordered = evidence.ordered(bench.dictionary.rows(claim.trial.candidate, Shape(delay=_UNIT_S)))
-    if len(ordered) < _MOST_ALONE:
+    rows = bench.dictionary.rows(claim.trial.candidate, Shape(delay=_UNIT_S))
+    if len(rows) < _MOST_ALONE:
         return True
-    loudest = max(ordered, key=lambda key: evidence.score({key: ordered[key]}).fitted)
-    others = {key: columns for key, columns in ordered.items() if key != loudest}
+    loudest = max(rows, key=lambda key: evidence.score({key: rows[key]}).fitted)
+    others = {key: columns for key, columns in rows.items() if key != loudest}
     delay, std = _delay_of(evidence.score(others))
     made = _made(claim)
     return abs(delay - made) < 0.5 * abs(made) + 4.0 * std

@@ -131,8 +131,8 @@ def test_steps_of_all_sessions_are_searched_with_the_products_of_one_set_of_colu
         rows = dictionary.rows(candidate, Shape(form, time=-1.0, session=session + 1))
         for start in np.sort(evidence.block_start[evidence.block_session == session])[1:]:
             on = (evidence.block_session != session) | (evidence.block_start >= start)
-            whole = evidence.products(evidence.ordered(rows))
-            after = whole.only(on.astype(float), evidence.in_blocks(whole))
+            whole = evidence.products.beside(rows)
+            after = whole.only(on.astype(float), evidence.products.in_blocks(whole))
             (score,) = evidence.score_products([after], [list(rows)])
             if 1.0 <= start <= dictionary.setting.durations_s[session] - 1.0:
                 here = best.get((form, session + 1), (0.0, 0.0))

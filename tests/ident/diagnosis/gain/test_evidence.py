@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ident.diagnosis.causes.candidates import Candidate
-from ident.diagnosis.gain import evidence as of_evidence
+from ident.diagnosis.gain import block_products
 from ident.diagnosis.gain.products import Rows
 from ident.diagnosis.healthy.bench import DiagnosisBench
 from ident.diagnosis.outcome.signatures import signature_bench
@@ -36,37 +36,37 @@ def columns_of(bench: DiagnosisBench) -> list[Rows]:
 def test_remembered_products_are_those_of_the_present_columns(
     bench: DiagnosisBench, spare_bytes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(of_evidence, "_SPARE_BYTES", spare_bytes)
+    monkeypatch.setattr(block_products, "_SPARE_BYTES", spare_bytes)
     evidence, rows = bench.evidence, columns_of(bench)
-    columns = evidence.ordered(of(bench, "base_tilt", -1))
-    known = evidence.alone(columns)
+    columns = of(bench, "base_tilt", -1)
+    known = evidence.products.alone(columns)
     numbers, fits = [], []
     for extra in ([rows[0], rows[1]], [rows[1]], [rows[2], rows[0], rows[1]], [], [rows[0], rows[1]]):
         evidence.replace(extra)
         numbers.append(evidence.beside_what)
         fits.append(evidence.full.values)
-        again, fresh = evidence.products(columns, known), evidence.products(columns)
+        again, fresh = evidence.products.beside(columns, known), evidence.products.beside(columns)
         for here, there in zip(again.sums, fresh.sums, strict=True):
             np.testing.assert_allclose(here, there, atol=1e-12 * np.abs(there).max())
-        blocks = evidence.in_blocks(again)
+        blocks = evidence.products.in_blocks(again)
         np.testing.assert_allclose(again.sums[0], np.einsum("pb,bkl->pkl", evidence.parts, blocks))
         further = sum(next(iter(r.values())).shape[1] for r in extra)
         assert blocks.shape[2] == evidence.base_count + further
     np.testing.assert_allclose(fits[-1], fits[0], rtol=1e-9)
     # Forgotten columns come back as others.
     assert (numbers[-1] == numbers[0]) == (spare_bytes > 0)
-    assert (len(evidence._groups) == 2) == (spare_bytes == 0)
-    assert set(known.crossed) <= {group.number for group in evidence._groups.values()}
+    assert (len(evidence.products._groups) == 2) == (spare_bytes == 0)
+    assert set(known.crossed) <= {group.number for group in evidence.products._groups.values()}
 
 
 def test_sums_over_parts_and_covariances_are_those_of_all_products_of_blocks(bench: DiagnosisBench) -> None:
     evidence, rows = bench.evidence, columns_of(bench)
     evidence.replace(rows)
-    gram, target = evidence.sums(np.arange(evidence.blocks))
+    gram, target = evidence.products.sums(np.arange(evidence.blocks))
     fit = evidence.full
     np.testing.assert_allclose(gram.sum(axis=0) @ fit.values, target.sum(axis=0), rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(gram, gram.transpose(0, 2, 1))
-    of_parts = evidence.sums(np.argmax(evidence.parts, axis=0))
+    of_parts = evidence.products.sums(np.argmax(evidence.parts, axis=0))
     for found, expected in zip(of_parts, (evidence._part_gram, evidence._part_target), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
@@ -81,7 +81,7 @@ def test_sums_over_parts_and_covariances_are_those_of_all_products_of_blocks(ben
 
     # Of one group beside the others, from the fit with all of them.
     evidence.replace(rows[:2])
-    score = evidence.score(evidence.ordered(rows[2]))
+    score = evidence.score(rows[2])
     place = slice(len(fit.values) - len(score.coefficients), None)
     np.testing.assert_allclose(score.coefficients, fit.values[place], rtol=1e-6)
     active = score.uncertainty[1] / (score.uncertainty[1] - 1)

@@ -65,7 +65,7 @@ def test_what_a_coarse_law_leaves_of_a_fault_is_no_noise(
     bench = signature_bench([make("a.mcap", 1), make("b.mcap", 2, None, 1)], chain)
     side, joint = "joint", 1
     rows = {(side, joint): np.sin(np.arange(len(bench.nominal.rows[side].time)))[:, None]}
-    score = bench.evidence.score(bench.evidence.padded(rows))
+    score = bench.evidence.score(rows)
     trial = Trial(Candidate(EFFECTS["sensor_ripple"], joint), Shape(), score, rows)
     selection = Selection([Claim(trial, score)])
     sigma, inflation = bench.evidence.sigma[side], bench.evidence.variance_inflation[side]
