@@ -144,9 +144,9 @@ def sticking(make: Make, chain: Chain) -> Reference:
 
 @pytest.mark.slow
 def test_friction_that_all_healthy_days_show_is_in_the_reference_and_what_comes_and_goes_is_not(
-    make: Make, chain: Chain
+    make: Make, chain: Chain, sticking: Reference
 ) -> None:
-    lasting = commission([sticky(make, 0, 0.12), sticky(make, 1, 0.12)], chain).model.effects
+    lasting = sticking.model.effects
     assert [(entry["cause"], entry["joints"]) for entry in lasting] == [("stribeck", [2])]
     assert not commission([sticky(make, 0, 0.12), sticky(make, 1, -0.12)], chain).model.effects
 
