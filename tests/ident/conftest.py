@@ -13,7 +13,6 @@ from ident.dynamics.regressor import torque
 from lwr_driver.session import JointColumns, Phase, Session
 from tests.ident.known_arm import bench, estimated, truth_model  # noqa: F401  fixtures
 
-RATE = 250.0
 PERIOD_S = 10.0
 MOTOR_NOISE, JOINT_NOISE = 0.05, 0.03
 Change = Callable[[dict[str, np.ndarray]], None]
@@ -55,12 +54,11 @@ def path(time: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return q, qd, qdd
 
 
-@pytest.fixture(scope="session")
-def make(chain: Chain, bodies: np.ndarray) -> Callable[..., Session]:
-    """A session of two periods; `change` alters torques and positions in place before they are measured."""
+def maker(chain: Chain, bodies: np.ndarray, rate: float) -> Callable[..., Session]:
+    """Makes sessions of two periods; `change` alters torques and positions in place before they are measured."""
 
     def session(name: str, seed: int, change: Change | None = None, number: int = 0) -> Session:
-        time = np.arange(0.0, 2 * PERIOD_S + 3.0, 1.0 / RATE)
+        time = np.arange(0.0, 2 * PERIOD_S + 3.0, 1.0 / rate)
         q, qd, qdd = path(time, seed)
         sign = np.sign(qd)
         joint = torque(chain, q, qd, qdd, bodies) + 0.1 * sign + np.array([0.1, -0.2, 0.05])
@@ -78,8 +76,8 @@ def make(chain: Chain, bodies: np.ndarray) -> Callable[..., Session]:
                 topic, chain.joint_names, stamps, stamps, sequence, position, empty, effort, name
             )
 
-        phases = [Phase(int(stamps[round((1.5 + k * PERIOD_S) * RATE)]), f"period {k + 1}") for k in range(2)]
-        phases.append(Phase(int(stamps[round((1.5 + 2 * PERIOD_S) * RATE)]), "return"))
+        phases = [Phase(int(stamps[round((1.5 + k * PERIOD_S) * rate)]), f"period {k + 1}") for k in range(2)]
+        phases.append(Phase(int(stamps[round((1.5 + 2 * PERIOD_S) * rate)]), "return"))
         return Session(
             Path(name),
             {"robot": "three", "payload": "none"},
@@ -92,3 +90,15 @@ def make(chain: Chain, bodies: np.ndarray) -> Callable[..., Session]:
         )
 
     return session
+
+
+@pytest.fixture(scope="session")
+def make(chain: Chain, bodies: np.ndarray) -> Callable[..., Session]:
+    """Makes sessions at 125 Hz."""
+    return maker(chain, bodies, 125.0)
+
+
+@pytest.fixture(scope="session")
+def make_250_hz(chain: Chain, bodies: np.ndarray) -> Callable[..., Session]:
+    """The same with twice as many samples, for what is small."""
+    return maker(chain, bodies, 250.0)

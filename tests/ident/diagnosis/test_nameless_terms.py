@@ -28,6 +28,12 @@ def drag_by_neighbour(s: Signals) -> None:
 
 
 @pytest.fixture(scope="module")
+def make(make_250_hz: Make) -> Make:
+    """What is looked for here is small."""
+    return make_250_hz
+
+
+@pytest.fixture(scope="module")
 def found(make: Make, chain: Chain) -> Diagnosis:
     fitted = [make("a.mcap", 1, drag_by_neighbour), make("b.mcap", 2, drag_by_neighbour, 1)]
     return diagnose(fitted, chain, test=[make("c.mcap", 5, drag_by_neighbour, 2)])

@@ -58,6 +58,12 @@ def sweep() -> list[float]:
 
 
 @pytest.fixture(scope="module")
+def make(make_250_hz: Make) -> Make:
+    """What is looked for here is small."""
+    return make_250_hz
+
+
+@pytest.fixture(scope="module")
 def doubt(make: Make, chain: Chain) -> tuple[Diagnosis, Diagnosis]:
     """The diagnosis of an arm with the Stribeck effect from a poor session, and with the sweep besides."""
 

@@ -137,6 +137,12 @@ def sticky(make: Make, day: int, amplitude: float) -> list[Session]:
 
 
 @pytest.fixture(scope="module")
+def make(make_250_hz: Make) -> Make:
+    """What is looked for here is small."""
+    return make_250_hz
+
+
+@pytest.fixture(scope="module")
 def sticking(make: Make, chain: Chain) -> Reference:
     """Of an arm whose friction rises so on both days."""
     return commission([sticky(make, 0, 0.4), sticky(make, 1, 0.4)], chain)
