@@ -120,7 +120,7 @@ class Deviation:
     std: float
 
     @property
-    def lasts(self) -> bool:
+    def stays(self) -> bool:
         """Whether it stays beside the columns of a model: delays and stiffness, which are no torques, and the gains of
         the torque sensors and the sizes of the healthy effects where they are clear of zero, which the models predict
         as on these days."""

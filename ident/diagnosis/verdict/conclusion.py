@@ -31,7 +31,7 @@ from ident.diagnosis.verdict.confidence import believable
 from ident.diagnosis.verdict.confirmation import FELT_POWER, Confirmed, confirmed, contradicted, doubted
 from ident.diagnosis.verdict.extension import Member, extension, power_left, title, titles
 from ident.diagnosis.verdict.findings import in_order, limit_findings, loss_finding, sizeless
-from ident.diagnosis.verdict.models import changes_of, fitted_models, lasting, without_harm
+from ident.diagnosis.verdict.models import changes_of, fitted_models, staying, without_harm
 from ident.diagnosis.verdict.payloads import unchecked_masses
 from ident.diagnosis.verdict.refit import BY_IDENTIFY, Entries, left_by, refitted
 from ident.diagnosis.verdict.task import Baseline, State, Task
@@ -51,7 +51,7 @@ def conclude(task: Task, state: State) -> Diagnosis:
     bench, nuisance = state.bench, state.selection.nuisance_rows
     evidence, nominal, healthy = bench.evidence, bench.nominal, task.reference
     baseline = state.baseline if state.timing else None
-    baseline = baseline or Baseline.of(bench, nuisance, lasting(state.selection))
+    baseline = baseline or Baseline.of(bench, nuisance, staying(state.selection))
     borne_out, refuted = confirmed(task, state)
     claimed = _believed(task, state, borne_out)
     worn = _worn(task, state, claimed)

@@ -18,7 +18,7 @@ from ident.diagnosis.outcome.result import Finding
 from ident.diagnosis.rows.recording import usual_step
 from ident.diagnosis.verdict.confidence import believable
 from ident.diagnosis.verdict.confirmation import confirmed_delay
-from ident.diagnosis.verdict.models import lasting
+from ident.diagnosis.verdict.models import staying
 from ident.diagnosis.verdict.task import Baseline, State, Task
 from ident.effects import DELAYS, EFFECTS, PRESLIDING, Shape
 
@@ -55,7 +55,7 @@ def in_time(task: Task, state: State) -> State:
     if not late:
         return replace(state, left_out=tuple(doubtful))
     tolerated = [one.tolerance.rows for one in state.selection.deviations if not one.tolerance.delays]
-    beside = [one for one in lasting(state.selection) if not one.delays]
+    beside = [one for one in staying(state.selection) if not one.delays]
     baseline = Baseline.of(state.bench, tolerated, beside)
     shifted, bench, amounts = task.arm, state.bench, {c.trial.candidate.cause: _made(c) for c in late}
     healthy = _at_another_phase(task.reference) if DELAYS["motor"].cause in amounts else task.reference

@@ -33,9 +33,9 @@ Entries = tuple[Mapping[str, Any], ...]
 _CLEAR = 2.0
 
 
-def lasting(selection: Selection) -> list[Tolerance]:
+def staying(selection: Selection) -> list[Tolerance]:
     """The tolerated deviations that stay beside the columns of a model."""
-    return [one.tolerance for one in selection.deviations if one.lasts]
+    return [one.tolerance for one in selection.deviations if one.stays]
 
 
 class Models(NamedTuple):
@@ -80,7 +80,7 @@ def fitted_models(
         provenance,
     )
     own = [rows for m in members for rows in m.rows]
-    fit = ModelFit.of(evidence, own, lasting(selection))
+    fit = ModelFit.of(evidence, own, staying(selection))
     evidence.replace([*own, *selection.nuisance_rows])
     extended = replace(base, values=fit.values, covariance=fit.covariance)
     return Models(

@@ -93,8 +93,8 @@ class ModelFit:
         first = len(values) - len(beside)
         std = np.sqrt(np.maximum(np.diag(covariance)[first:], 0.0))
         found = [Deviation(*one) for one in zip(beside, values[first:].tolist(), std.tolist(), strict=True)]
-        if not all(one.lasts for one in found):
-            return cls.of(evidence, columns, [one.tolerance for one in found if one.lasts])
+        if not all(one.stays for one in found):
+            return cls.of(evidence, columns, [one.tolerance for one in found if one.stays])
         return cls(values[:p].copy(), covariance[:p, :p], found)
 
 
@@ -106,10 +106,10 @@ class Baseline:
     fit: ModelFit
 
     @classmethod
-    def of(cls, bench: DiagnosisBench, tolerated: Sequence[Rows], lasting: Sequence[Tolerance]) -> Baseline:
-        """Fitted on a bench. tolerated : deviations beside the rows. lasting : those beside the model."""
+    def of(cls, bench: DiagnosisBench, tolerated: Sequence[Rows], staying: Sequence[Tolerance]) -> Baseline:
+        """Fitted on a bench. tolerated : deviations beside the rows. staying : those beside the model."""
         held = held_out(bench.evidence, tolerated)
-        return cls(held, ModelFit.of(bench.evidence, (), lasting))
+        return cls(held, ModelFit.of(bench.evidence, (), staying))
 
 
 @dataclass(frozen=True, eq=False)

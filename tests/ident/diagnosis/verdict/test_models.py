@@ -11,7 +11,7 @@ import pytest
 from ident.diagnosis.causes.selection import Selection
 from ident.diagnosis.causes.tolerances import Deviation, Kind, Tolerance
 from ident.diagnosis.rows.nominal_arm import NominalArm
-from ident.diagnosis.verdict.models import lasting, turning_friction
+from ident.diagnosis.verdict.models import staying, turning_friction
 from ident.diagnosis.verdict.task import ModelFit
 from ident.effects import DELAYS, PRESLIDING, entry_of
 
@@ -42,7 +42,7 @@ def test_a_model_stays_beside_delays_stiffness_and_clear_gains_alone() -> None:
         Deviation(Tolerance(Kind.HABIT, 0, {}, np.inf, stribeck), 0.8, 0.1),
         Deviation(Tolerance(Kind.HABIT, 1, {}, np.inf, late), 0.8, 0.1),
     ]
-    names = [one.name for one in lasting(tolerated)]
+    names = [one.name for one in staying(tolerated)]
     assert names == ["motor delay", "compliance 2", "gain 1", f"habit 2: {late[0]} 0"]
 
 
