@@ -60,10 +60,11 @@ class Bench:
         model: DynamicModel | None = None,
         controller_model: bool = False,
         motor: bool = True,
+        rate_hz: float = 125.0,
     ) -> Session:
         """Record the arm moving along a random excitation; torque noise on (joint, motor) sensors."""
         source = model or self.truth
-        period_s, rate = 12.0, 250.0
+        period_s, rate = 12.0, rate_hz
         t, q, qd, qdd = self.motion(seed, periods * period_s + 2.0, rate, period_s)
         mounted = None if payload == "none" else payload
         rng = np.random.default_rng(seed + 1000)

@@ -38,7 +38,7 @@ def unloaded(bench: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def loaded(bench: Any) -> Any:
-    return bench.session("loaded", seed=2, payload="load")
+    return bench.session("loaded", seed=2, payload="load", rate_hz=250.0)
 
 
 def scores(result: Validation, side: str) -> np.ndarray:
