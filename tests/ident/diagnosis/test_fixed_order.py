@@ -9,7 +9,7 @@ import sys
 _SCRIPT = """
 import numpy as np
 from types import SimpleNamespace
-from ident.diagnosis.gain.evidence import Evidence
+from ident.diagnosis.gain.block_products import BlockProducts
 
 random = np.random.default_rng(1)
 keys = [(side, joint) for side in ("motor", "joint") for joint in range(7)]
@@ -17,9 +17,9 @@ columns = {key: random.normal(size=(60, 2)) for key in keys}
 weights = dict(zip(keys, random.uniform(1.0, 1e3, len(keys))))
 starts = dict.fromkeys(("motor", "joint"), np.array([0, 20, 40, 60]))
 mask = dict.fromkeys(keys, np.ones(60, dtype=bool))
-evidence = SimpleNamespace(mask=mask, _weights=weights, _starts=starts)
+products = SimpleNamespace(_mask=mask, weights=weights, rows=SimpleNamespace(starts=starts))
 joined = {key: (values, np.arange(2)) for key, values in columns.items()}
-print(Evidence._cross(evidence, columns, joined, np.arange(3), 2).tobytes().hex())
+print(BlockProducts._cross(products, columns, joined, np.arange(3), 2).tobytes().hex())
 """
 
 

@@ -54,6 +54,6 @@ def test_products_of_rows_that_stay_are_kept_for_any_noise(elastic: tuple[Nomina
     assert mine.fitted_rows is again
     np.testing.assert_array_equal(mine.full.values, other.full.values)
     each = np.arange(mine.blocks)
-    for one_sum, other_sum in zip(mine.sums(each), other.sums(each), strict=True):
+    for one_sum, other_sum in zip(mine.products.sums(each), other.products.sums(each), strict=True):
         np.testing.assert_array_equal(one_sum, other_sum)
     assert mine.chi_square == other.chi_square
