@@ -25,6 +25,7 @@ from ident.diagnosis.gain.products import Floats, Rows
 from ident.diagnosis.healthy.bench import DiagnosisBench
 from ident.diagnosis.healthy.reference import INERTIA_BY_PHASE, Reference, unsure
 from ident.diagnosis.outcome.result import Finding, FindingEvidence, Value
+from ident.diagnosis.rows.nominal_arm import NominalArm
 from ident.diagnosis.verdict.confidence import HARDLY
 from ident.effects import FRICTION_TEMPERATURE, WEAR
 from ident.effects.course import Course
@@ -131,8 +132,7 @@ def wear(
         if p_value > _ONE_IN or np.max(np.abs(share)) < _MATTERS:
             continue
         sizes = dict(zip(labels, np.abs(share / std).tolist(), strict=True))
-        bends = nominal.arm.compliance
-        stiff = bool(bends[joint] > 0.0 and not unsure(bends, nominal.arm.compliance_std)[joint])
+        stiff = _stiff(nominal.arm, joint)
         heavier = sizes.get("inertia", 0.0) > max(_CLEAR, 0.5 * max(sizes.values()))
         torque = nominal.rows["motor"].matrix[joint][:, places] @ change
         columns = [*claimed, *tolerated, {("motor", joint): torque[:, None]}]
@@ -162,6 +162,14 @@ def wear(
     return Worn(found, {label: float(np.median(some)) for label, some in least.items()}, reference.sets)
 
 
+def _stiff(arm: NominalArm, joint: int) -> bool:
+    """Whether the stiffness is known that a joint's motor works against: its own; behind published motors that of all
+    joints, for the links ring on all their springs together."""
+    unknown = unsure(arm.compliance, arm.compliance_std)
+    known = not (unknown.any() if arm.encoder == "motor" else unknown[joint])
+    return known and bool(arm.compliance[joint] > 0.0)
+
+
 def _left(
     bench: DiagnosisBench,
     reference: Reference,
@@ -169,10 +177,11 @@ def _left(
     remainders: Sequence[Remainder],
     joint: int,
 ) -> float:
-    """Gain of the remainders in a joint's motor torque beside columns with its wear."""
+    """Gain of the remainders in a joint's torques beside columns with its wear: what its sensor shows acts on the
+    drive, too."""
 
     def mine(found: Sequence[Remainder]) -> float:
-        return sum(r.gain for r in found if (r.side, r.joint - 1) == ("motor", joint))
+        return sum(r.gain for r in found if r.joint - 1 == joint)
 
     if not mine(remainders):
         return 0.0

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from ident.diagnosis import Diagnosis, Reference, commission, diagnose
 from ident.diagnosis.healthy.day_spread import habit
 from ident.diagnosis.healthy.reference import INERTIA_BY_PHASE
 from ident.diagnosis.outcome.result import Unexplained
+from ident.diagnosis.verdict import wear as of_wear
 from ident.dynamics.kinematics import Chain
 from lwr_driver.session import Session
 from tests.ident.diagnosis.changes import Make, Signals, pair
@@ -110,6 +113,19 @@ def test_a_torque_of_no_name_bends_the_parameters_and_is_no_wear(
     found = diagnose(pair(make, lagging), chain, reference=reference)
     assert not worn(found)
     assert any((u.side, u.joint) == ("motor", 2) for u in (*found.nameless, *found.unexplained))
+
+
+@pytest.mark.parametrize(("side", "joint", "left"), [("motor", 2, 7.0), ("joint", 2, 7.0), ("joint", 1, 0.0)])
+def test_what_the_sensor_of_a_joint_shows_beyond_a_name_bends_its_drive_too(
+    monkeypatch: pytest.MonkeyPatch, side: str, joint: int, left: float
+) -> None:
+    rest = SimpleNamespace(side=side, joint=joint, gain=7.0)
+    monkeypatch.setattr(of_wear, "find_remainders", lambda *_: [rest])
+    bench: Any = SimpleNamespace(
+        evidence=SimpleNamespace(replace=lambda _: None, settings=None), dictionary=None
+    )
+    reference: Any = SimpleNamespace(limits=dict)
+    assert of_wear._left(bench, reference, [], [rest], 1) == left  # type: ignore[list-item]
 
 
 def test_an_error_far_beyond_that_of_the_healthy_days_is_unexplained_though_no_variable_explains_it(
@@ -246,6 +262,17 @@ def test_another_inertia_is_sure_only_behind_a_known_stiffness(
         confidence.append(finding.confidence)
     known, unknown = confidence
     assert unknown <= 0.75 < known
+
+
+def test_behind_published_motors_the_stiffness_of_all_joints_counts() -> None:
+    def stiff(encoder: Any, joint: int, *std: float) -> bool:
+        arm: Any = SimpleNamespace(encoder=encoder, compliance=np.full(3, 1e-4), compliance_std=np.array(std))
+        return of_wear._stiff(arm, joint)
+
+    assert stiff("motor", 0, 1e-6, 1e-6, 1e-6)
+    assert not stiff("motor", 0, 1e-6, 5e-5, 1e-6)
+    assert stiff("link", 0, 1e-6, 5e-5, 1e-6)
+    assert not stiff("link", 1, 1e-6, 5e-5, 1e-6)
 
 
 def test_a_gain_beyond_the_usual_is_told_with_its_own_size(
