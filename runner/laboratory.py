@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import random
 import socket
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from fri.errors import OperatorError
+from fri.errors import NetworkError, OperatorError
 from fri.handshake import IdentificationHandshake
 from lwr_driver.arm import Arm
 from lwr_driver.arm.cell import Cell
@@ -20,6 +21,9 @@ from sim_backend.configuration import load_configuration
 from sim_backend.pendant import Pendant
 from sim_backend.process import EmulatorProcess
 from sim_backend.robot import robot_file
+
+# Ports that no operating system hands out by itself.
+_UNASSIGNED = range(20000, 32768)
 
 
 class Person:
@@ -194,7 +198,10 @@ class Laboratory:
 
 
 def free_port(address: str) -> int:
-    """An unused UDP port of `address`."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind((address, 0))
-        return int(probe.getsockname()[1])
+    """An unused UDP port of `address`. Another program that asks for any port gets none of these, before its user binds
+    it."""
+    for port in random.sample(_UNASSIGNED, len(_UNASSIGNED)):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
+            probe.bind((address, port))
+            return port
+    raise NetworkError(f"no UDP port of {address} can be bound; check that the address is this PC's")
