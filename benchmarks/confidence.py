@@ -212,6 +212,10 @@ def main(
 
 def _fit(said: Sequence[Said], name: str, *, onward: bool, write: bool) -> None:
     said = [one for one in said if one.grounds]
+    if any(not stored.LIMITS.keys() <= one.grounds.keys() for one in said):
+        raise click.ClickException(
+            "diagnoses of an earlier version lack a ground; diagnose their cases again"
+        )
     if any(bool(one.grounds.get("alone")) != (name == stored.ALONE) for one in said):
         raise click.ClickException("diagnoses with and without a reference have weights apart; see --alone")
     if not said:
