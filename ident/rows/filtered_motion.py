@@ -211,7 +211,6 @@ class Motion:
         part = slice(first - self.low, max(last, first) - self.low)
         times, flagged = self.times[part] - settings.joint_delay, self.flagged[part]
         q, qd, qdd, away = self._at(times)
-        taken_back = settings.takes_links_back and self.drive is not None
         return TorqueChannel(
             "joint",
             times,
@@ -222,8 +221,12 @@ class Motion:
             flagged,
             away & ~flagged,
             period_s=self.dt,
-            taken_back=taken_back,
+            taken_back=self._taken_back(settings),
         )
+
+    def _taken_back(self, settings: SignalSettings) -> bool:
+        """Whether q, qd and qdd are those of the links behind published motors."""
+        return settings.takes_links_back and self.drive is not None
 
     def _at(self, times: Floats) -> tuple[Floats, Floats, Floats, BoolArray]:
         """q, qd, qdd and whether away from reversals at other times."""
@@ -267,7 +270,7 @@ class Motion:
         if self.drive is not None:
             moved = (self.drive.speed, self.drive.acceleration)
             drive = DriveMotion(*(interpolate_uniform(state, self.first, self.dt, actual) for state in moved))
-        known, taken_back = away & ~flagged, settings.takes_links_back and drive is not None
+        known, taken_back = away & ~flagged, self._taken_back(settings)
         return TorqueChannel(
             "motor", actual, q, qd, qdd, torque[inside], flagged, known, drive, period, taken_back
         )

@@ -42,7 +42,7 @@ class BlockProducts:
 
     def __init__(self, fitted: FittedRows, weights: Mapping[Key, float], base_count: int) -> None:
         self.rows, self.weights, self.base_count = fitted, weights, base_count
-        self._mask = {key: own.mask for key, own in fitted.keys.items()}
+        self.mask = {key: own.mask for key, own in fitted.keys.items()}
         self._each, self._part = np.arange(fitted.blocks), np.argmax(fitted.parts, axis=0)
         self._groups: dict[int, Group] = {}
         self._next = count()
@@ -122,7 +122,7 @@ class BlockProducts:
             np.add.at(target[:, here], of, group.products.target)
         for key, (columns, places) in sorted(self._together(self.present).items()):
             starts, weight = self.rows.starts[key[0]], self.weights[key]
-            add_own_products(columns, self._mask[key], starts, weight, p + places, of, gram)
+            add_own_products(columns, self.mask[key], starts, weight, p + places, of, gram)
         return gram, target
 
     def left(self, values: Floats) -> Floats:
@@ -168,7 +168,7 @@ class BlockProducts:
         target = np.zeros((blocks, width, 1))
         places = np.arange(width)
         for key, wide in columns.items():
-            mask, starts, weight = self._mask[key], self.rows.starts[key[0]], self.weights[key]
+            mask, starts, weight = self.mask[key], self.rows.starts[key[0]], self.weights[key]
             fitted = self.rows.keys[key]
             add_products(wide, fitted.columns, mask, starts, weight, fitted.acting, into, base)
             add_own_products(wide, mask, starts, weight, places, into, own)
@@ -248,7 +248,7 @@ class BlockProducts:
         """The same for all keys, remembered as long as the present columns stay."""
         names = tuple(group.number for group in groups)
         if names not in self._joined:
-            self._joined[names] = self._join(groups, self._mask)
+            self._joined[names] = self._join(groups, self.mask)
         return self._joined[names]
 
     def _cross(self, a: Rows, b: Mapping[Key, _Joined], into: Numbers, width: int) -> Floats:
@@ -258,7 +258,7 @@ class BlockProducts:
         # In a fixed order: the last digits of a sum depend on it.
         for key in sorted(a.keys() & b.keys()):
             (columns, places), starts = b[key], self.rows.starts[key[0]]
-            add_products(a[key], columns, self._mask[key], starts, self.weights[key], places, into, total)
+            add_products(a[key], columns, self.mask[key], starts, self.weights[key], places, into, total)
         return total
 
 

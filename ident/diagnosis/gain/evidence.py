@@ -81,7 +81,6 @@ class Evidence:
             fitted.block_start,
         )
         self.fold, self.parts = fitted.fold, fitted.parts
-        self.mask = {key: own.mask for key, own in fitted.keys.items()}
         weights: dict[Key, float] = {}
         self._independent: dict[Key, float] = {}
         for (side, j), own in fitted.keys.items():
@@ -90,6 +89,7 @@ class Evidence:
             self._independent[side, j] = own.count / inflation
         self.base_count = len(nominal.base)
         self.products = BlockProducts(fitted, weights, self.base_count)
+        self.mask = self.products.mask
         self._kept_held: tuple[Fit, Floats] | None = None
         self._kept_free: Fit | None = None
         self._fit_present()

@@ -79,7 +79,7 @@ def interval(
     table = _by_block(before, after, dict.fromkeys(keys, 1.0))
     if not len(table):
         return 0.0, 0.0, 0.0, 0.0
-    drawn = _drawn(table, seed)
+    drawn = drawn_sums(table, np.random.default_rng(seed))
     difference = np.sqrt(drawn[:, 0] / drawn[:, 2]) - np.sqrt(drawn[:, 1] / drawn[:, 2])
     total = table.sum(axis=0)
     low, high = np.quantile(difference, [tail, 1.0 - tail])
@@ -94,7 +94,7 @@ def fall(before: HeldOut, after: HeldOut, weights: Mapping[Key, float], seed: in
     table = _by_block(before, after, weights)
     if not len(table):
         return 0.0, 0.0
-    drawn = _drawn(table, seed)
+    drawn = drawn_sums(table, np.random.default_rng(seed))
     low, high = np.quantile(drawn[:, 0] - drawn[:, 1], [0.025, 0.975])
     return float(low), float(high)
 
@@ -151,8 +151,7 @@ def _by_block(before: HeldOut, after: HeldOut, weights: Mapping[Key, float]) -> 
     return np.array(list(blocks.values()))
 
 
-def _drawn(table: Floats, seed: int) -> Floats:
-    """Sums (draws, 3) over the same number of blocks, drawn with replacement."""
-    rng = np.random.default_rng(seed)
+def drawn_sums(table: Floats, rng: np.random.Generator) -> Floats:
+    """Sums (draws, k) of a table (blocks, k) over the same number of blocks, drawn with replacement."""
     drawn: Floats = table[rng.integers(0, len(table), (_DRAWS, len(table)))].sum(axis=1)
     return drawn

@@ -7,15 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ident.diagnosis.gain.held_out import FELT_WORSE
+from ident.diagnosis.gain.held_out import FELT_WORSE, drawn_sums
 from ident.diagnosis.gain.products import Floats
 from ident.estimation.identification import Known
 from ident.estimation.scores import SessionScore
 from ident.estimation.validate import validate
 from ident.model import DynamicModel
 from lwr_driver.session import Session
-
-_DRAWS = 1000
 
 
 class TorqueErrors(NamedTuple):
@@ -62,11 +60,12 @@ class TorqueErrors(NamedTuple):
         rng, shares = np.random.default_rng(1), list[Floats]()
         for own, theirs in zip(self.scores, base.scores, strict=True):
             a, b = _table(own), _table(theirs)
-            if a.shape == b.shape and len(a):
-                drawn = rng.integers(0, len(a), (_DRAWS, len(a)))
-                shares.append(a[drawn].sum(axis=1) / np.maximum(b[drawn].sum(axis=1), 1e-24))
-        left = np.concatenate(shares, axis=1) if shares else np.ones((1, 0))
-        return bool(left.size) and float(np.quantile(left.mean(axis=1), 0.025)) <= 1.0
+            if a.shape == b.shape and a.size:
+                left, before = np.split(drawn_sums(np.hstack([a, b]), rng), 2, axis=1)
+                shares.append(left / np.maximum(before, 1e-24))
+        if not shares:
+            return False
+        return float(np.quantile(np.concatenate(shares, axis=1).mean(axis=1), 0.025)) <= 1.0
 
     def rms(self) -> dict[str, Floats]:
         """Rms (n,) [Nm] of each joint by side, pooled over the sessions by their number of samples; a side without a

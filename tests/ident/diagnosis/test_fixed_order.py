@@ -17,7 +17,7 @@ columns = {key: random.normal(size=(60, 2)) for key in keys}
 weights = dict(zip(keys, random.uniform(1.0, 1e3, len(keys))))
 starts = dict.fromkeys(("motor", "joint"), np.array([0, 20, 40, 60]))
 mask = dict.fromkeys(keys, np.ones(60, dtype=bool))
-products = SimpleNamespace(_mask=mask, weights=weights, rows=SimpleNamespace(starts=starts))
+products = SimpleNamespace(mask=mask, weights=weights, rows=SimpleNamespace(starts=starts))
 joined = {key: (values, np.arange(2)) for key, values in columns.items()}
 print(BlockProducts._cross(products, columns, joined, np.arange(3), 2).tobytes().hex())
 """
